@@ -1,0 +1,31 @@
+#pragma once
+// Gaussians to files and back: INRIA PLY (formats.md 1.1) and OpenVDB points (formats.md 2.2).
+#include <string>
+#include <vector>
+
+#include "splat/gaussians.h"
+
+namespace vdbc {
+
+/// Writes the INRIA layout: binary little endian, x y z nx ny nz f_dc f_rest opacity scale rot, LF,
+/// only `float` properties. Gaussians with NaN or Inf are dropped, opacity logits clamped to +-15,
+/// quaternions normalised. Temporary name, then rename. Throws Error.
+void writePly(const Gaussians& gaussians, const std::string& path);
+/// Reads INRIA-like PLY by any conforming writer: any property order, normals and f_rest optional.
+/// Throws Error on anything else: truncated, no splat properties, compressed PLY, lists, ASCII.
+Gaussians readPly(const std::string& path);
+
+/// Per-Gaussian provenance that only the VDB points file carries (decision 4 of the design).
+struct Provenance {
+  std::vector<uint8_t> generated;  // [N] 0 or 1
+  std::vector<float> probability;  // [N] 0-1
+};
+
+/// One points grid `splats`: P fixed point 16 bit, scale vec3s, orient quats (x y z w), GS_Alpha,
+/// Cd scene-linear, GS_SPH_R/G/B float[16], groups `completed` (generated ones), `probability`.
+/// Counts are mirrored in metadata. Voxel size is chosen for about 8 points a voxel.
+void writePointsVdb(const Gaussians& gaussians, const Provenance& provenance,
+                    const std::string& path);
+Gaussians readPointsVdb(const std::string& path, Provenance* provenance = nullptr);
+
+}  // namespace vdbc

@@ -1,0 +1,31 @@
+#pragma once
+// 3-D Gaussians as plain arrays, in the encodings of the 3DGS file format.
+#include <Eigen/Core>
+#include <cstdint>
+#include <vector>
+
+namespace vdbc {
+
+constexpr float kSh0 = 0.28209479177387814f;  // colour (display sRGB) = 0.5 + kSh0 * sh[0]
+
+/// N anisotropic Gaussians; arrays are parallel. World frame of the input, metres.
+struct Gaussians {
+  int sh_degree = 0;                       // 0..3
+  std::vector<Eigen::Vector3f> mean;       // [N] metres
+  std::vector<Eigen::Vector3f> log_scale;  // [N] natural log of sigma, metres
+  std::vector<Eigen::Vector4f> rotation;   // [N] quaternion w x y z; need not be normalised
+  std::vector<float> opacity_logit;        // [N]
+  std::vector<float> sh;                   // [N, (sh_degree+1)^2, 3] coefficient-major, RGB fastest
+
+  int64_t size() const { return int64_t(mean.size()); }
+  int shCoefficients() const { return (sh_degree + 1) * (sh_degree + 1); }
+  void resize(int64_t n, int degree);
+};
+
+/// Throws Error unless all arrays have matching lengths.
+void requireConsistent(const Gaussians& gaussians);
+
+/// Appends `more` (same SH degree, else Error).
+void append(Gaussians* gaussians, const Gaussians& more);
+
+}  // namespace vdbc

@@ -1,0 +1,46 @@
+#pragma once
+// One posed RGB-D view, and the readers that make views from files (formats.md 3).
+#include <string>
+#include <vector>
+
+#include "splat/image.h"
+#include "vdb/camera.h"
+#include "vdb/carve.h"
+
+namespace vdbc {
+
+/// A posed view. Pointmaps become planar depth when read (points that do not reproject within half a
+/// pixel of their own pixel are invalid), so there is one representation. Spec E1, E2.
+struct View {
+  std::string name;          // file name, for messages and contact sheets
+  Camera camera;             // OpenCV axes, camera-to-world, metres
+  Image colour;              // [H, W, 3] display sRGB, 0-1
+  std::vector<float> depth;  // [H * W] planar z, metres; 0 where there is none
+
+  DepthView depthView() const { return {camera, depth.data()}; }
+};
+
+struct ReadViewsSettings {
+  std::vector<int> frames;  // indices into the folder's frames; empty = all
+  int max_side = 0;         // shrink so that the longer side is at most this; 0 = as stored. Colour is
+                            // area-averaged, depth takes the nearest sample
+};
+
+/// Reads views from: a folder with transforms.json, a transforms.json, an .exr or a folder of .exr
+/// with Z or P and worldToCamera + worldToNDC. Adds no frame conversion beyond camera axes.
+/// Throws Error: no views, views without depth, mismatched sizes, corrupt files, frames out of range,
+/// distortion other than zero, singular or non-rigid poses, depth without one valid pixel.
+std::vector<View> readViews(const std::string& path, const ReadViewsSettings& settings = {});
+
+/// The unit vector that points up in the world of views read from `path`: +Z for transforms.json,
+/// +Y for EXR.
+Eigen::Vector3d conventionalUp(const std::string& path);
+
+/// A folder that readViews() reads back: transforms.json, PNG colour, 16-bit millimetre depth PNG.
+void writeViews(const std::vector<View>& views, const std::string& folder);
+
+/// One multi-channel EXR (half RGB scene-linear, float Z planar) with spec-conforming worldToCamera
+/// and worldToNDC.
+void writeViewExr(const View& view, const std::string& path);
+
+}  // namespace vdbc

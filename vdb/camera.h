@@ -1,0 +1,36 @@
+#pragma once
+// Pinhole camera: OpenCV axes (x right, y down, z forward), camera-to-world, metres.
+#include <Eigen/Geometry>
+
+namespace vdbc {
+
+/// Pinhole camera without distortion. Pixel (i, j) covers [i, i+1] x [j, j+1]: centres at +0.5.
+struct Camera {
+  int width = 0, height = 0;  // pixels
+  double fx = 0, fy = 0;      // focal lengths, pixels
+  double cx = 0, cy = 0;      // principal point, pixels, corner-based (pixel centres at +0.5)
+  /// Camera (x right, y down, z forward) to world, metres.
+  Eigen::Isometry3d world_from_camera = Eigen::Isometry3d::Identity();
+
+  /// World point -> (u, v, z): pixel position and planar depth (metres). z <= 0 is behind the camera;
+  /// u and v are then meaningless.
+  Eigen::Vector3d project(const Eigen::Vector3d& p_world) const {
+    const Eigen::Vector3d p = world_from_camera.inverse() * p_world;
+    return {fx * p.x() / p.z() + cx, fy * p.y() / p.z() + cy, p.z()};
+  }
+  /// Pixel position and planar depth z (metres) -> world point.
+  Eigen::Vector3d unproject(double u, double v, double z) const {
+    return world_from_camera * Eigen::Vector3d((u - cx) / fx * z, (v - cy) / fy * z, z);
+  }
+};
+
+/// The same camera for an image resized to width x height.
+inline Camera resized(const Camera& camera, int width, int height) {
+  Camera c = camera;
+  const double sx = double(width) / camera.width, sy = double(height) / camera.height;
+  c.width = width, c.height = height;
+  c.fx *= sx, c.cx *= sx, c.fy *= sy, c.cy *= sy;
+  return c;
+}
+
+}  // namespace vdbc

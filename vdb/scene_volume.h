@@ -1,0 +1,52 @@
+#pragma once
+// Where the grid lies in the world, and the grids that leave the program (formats.md 2.3).
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "vdb/carve.h"
+
+namespace vdbc {
+
+struct VolumeSettings {
+  float voxel_m = 0.1f;
+  /// Unit vector that points up in the input's world frame.
+  Eigen::Vector3d up = Eigen::Vector3d::UnitZ();
+  /// World box (min, max corners, metres) to complete; else fitted to what was seen.
+  std::optional<Eigen::AlignedBox3d> bounds;
+  float margin_m = 1.0f;           // horizontal room for what was not seen, when fitted
+  float vertical_margin_m = 0.2f;  // the same above and below
+  bool align_walls = true;         // turn the grid about `up` so that walls lie along its axes
+};
+
+/// The volume of a scene: z of the grid is up, yaw follows the walls (strongest direction of the
+/// horizontal surface normals), the box holds the seen points (0.5 % outliers trimmed at each side)
+/// and the cameras, grown by the margins; bounds are multiples of 4 voxels. Decision 2 of the design.
+/// Throws Error if no view has a usable depth or the volume would exceed 4,096 voxels a side.
+VoxelFrame fitVolume(const std::vector<DepthView>& views, const VolumeSettings& settings,
+                     const CarveSettings& carving);
+
+/// What a finished scene says about its voxels; arrays are parallel, [N].
+struct SceneVoxels {
+  VoxelFrame frame;
+  std::vector<Coord> ijk;
+  std::vector<Eigen::Vector3f> colour_linear;  // scene-linear Rec.709
+  std::vector<float> density;                  // 0-1, opacity of the voxel
+  std::vector<uint8_t> observed;               // 1: an input view saw it; 0: generated
+  std::vector<float> probability;              // occupancy probability, 1 for observed
+  std::vector<int32_t> bfs_level;              // growth level, 0 for observed
+  TokenMask empty;                             // E of the input views (kept open in `surface`)
+};
+
+/// Writes standard 5-4-3 grids: surface (level set), density (fog), Cd (vec3s), observed, generated
+/// (bool), probability, bfs_level (float); world transform with the grid's rotation; metadata as
+/// formats.md 2.3. Voxel ijk's centre is at ijk + 0.5 in frame units: the file's transform has the
+/// half-voxel shift so that grid index space is cell-centred. Written to a temporary name and renamed.
+/// Throws Error where the file cannot be written.
+void writeSceneVdb(const SceneVoxels& voxels, const std::string& path);
+
+/// Reads back what writeSceneVdb wrote (all but `surface`, which is derived). Throws Error on files
+/// that are missing, corrupt or lack the grids.
+SceneVoxels readSceneVdb(const std::string& path);
+
+}  // namespace vdbc
