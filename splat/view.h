@@ -27,20 +27,23 @@ struct ReadViewsSettings {
 };
 
 /// Reads views from: a folder with transforms.json, a transforms.json, an .exr or a folder of .exr
-/// with Z or P and worldToCamera + worldToNDC. Adds no frame conversion beyond camera axes.
+/// with Z or P and worldToCamera + worldToNDC. Adds no frame conversion beyond camera axes; a
+/// transforms.json's applied_transform and applied_scale are undone. 0 and 65535 in a 16-bit depth
+/// PNG are no measurement. Frames are read in parallel; the first bad frame's Error is thrown.
 /// Throws Error: no views, views without depth, mismatched sizes, corrupt files, frames out of range,
 /// distortion other than zero, singular or non-rigid poses, depth without one valid pixel.
 std::vector<View> readViews(const std::string& path, const ReadViewsSettings& settings = {});
 
-/// The unit vector that points up in the world of views read from `path`: +Z for transforms.json,
-/// +Y for EXR.
+/// The unit vector that points up in the world of views read from `path`: +Z for transforms.json
+/// (turned back by its applied_transform), +Y for EXR.
 Eigen::Vector3d conventionalUp(const std::string& path);
 
-/// A folder that readViews() reads back: transforms.json, PNG colour, 16-bit millimetre depth PNG.
+/// A folder that readViews() reads back: transforms.json, PNG colour, 16-bit millimetre depth PNG
+/// (depth beyond 65.534 m becomes none). transforms.json is written last. Throws Error.
 void writeViews(const std::vector<View>& views, const std::string& folder);
 
 /// One multi-channel EXR (half RGB scene-linear, float Z planar) with spec-conforming worldToCamera
-/// and worldToNDC.
+/// and worldToNDC; pixels without depth get 1e10. Temporary name, then rename. Throws Error.
 void writeViewExr(const View& view, const std::string& path);
 
 }  // namespace vdbc

@@ -12,9 +12,9 @@ namespace vdbc {
 /// The grid that everything is computed on: a box of voxels and its place in the world.
 /// world = origin + rotation * (ijk * voxel_m); voxel ijk covers [ijk, ijk + 1) (corner-based).
 struct VoxelFrame {
-  float voxel_m = 0.1f;                                  // voxel edge, metres
+  float voxel_m = 0.1f;                                               // voxel edge, metres
   Eigen::Isometry3d world_from_grid = Eigen::Isometry3d::Identity();  // metres to metres
-  CoordBBox bounds;                                      // voxels of the volume, inclusive
+  CoordBBox bounds;  // voxels of the volume, inclusive
 
   Eigen::Vector3d toIndex(const Eigen::Vector3d& p_world) const {
     return world_from_grid.inverse() * p_world / double(voxel_m);
@@ -24,7 +24,8 @@ struct VoxelFrame {
   }
 };
 
-/// A camera and its planar depth, [height * width] row-major, metres; 0 (or less, or NaN) is no ray.
+/// A camera and its planar depth, [height * width] row-major, metres; 0 (or less, or NaN) is no
+/// ray.
 struct DepthView {
   Camera camera;
   const float* depth = nullptr;
@@ -47,10 +48,10 @@ struct ObservedSpace {
 /// Returns [height * width].
 std::vector<float> usableDepth(const DepthView& view, const CarveSettings& settings);
 
-/// F and E exactly as if the ray of every usable pixel centre were traversed in double precision with
-/// openvdb::math::DDA from the camera to the voxel of its point; F wins over E. Voxel-driven: each
-/// candidate voxel is projected, a min/max depth pyramid decides most, the rest get exact ray-box
-/// tests. Parallel; the result does not depend on the number of threads. Spec A1.
+/// F and E exactly as if the ray of every usable pixel centre were traversed in double precision
+/// with openvdb::math::DDA from the camera to the voxel of its point; F wins over E. Voxel-driven:
+/// each candidate voxel is projected, a min/max depth pyramid decides most, the rest get exact
+/// ray-box tests. Parallel; the result does not depend on the number of threads. Spec A1.
 ObservedSpace carve(const VoxelFrame& frame, const std::vector<DepthView>& views,
                     const CarveSettings& settings, Progress& progress);
 
@@ -60,9 +61,9 @@ ObservedSpace carveByTraversal(const VoxelFrame& frame, const std::vector<DepthV
 
 enum class NodeState : uint8_t { kUnobserved = 0, kEmpty = 1, kFilled = 2 };
 
-/// States pooled to a tree level: filled if any voxel is F, empty if all voxels inside the bounds are
-/// E, else unobserved (spec A9). One entry per node of `level` that overlaps the bounds, in x, y, z
-/// raster order (z fastest) of `box`.
+/// States pooled to a tree level: filled if any voxel is F, empty if all voxels inside the bounds
+/// are E, else unobserved (spec A9). One entry per node of `level` that overlaps the bounds, in x,
+/// y, z raster order (z fastest) of `box`.
 struct NodeStates {
   int level = 1;
   CoordBBox box;  // in units of `level`, inclusive

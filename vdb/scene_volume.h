@@ -8,6 +8,10 @@
 
 namespace vdbc {
 
+constexpr int kMaxVolumeSide = 4096;  // voxels
+constexpr int kMaxVolumeIndex =
+    1 << 28;  // voxels; far inside int32, so sums of coordinates are too
+
 struct VolumeSettings {
   float voxel_m = 0.1f;
   /// Unit vector that points up in the input's world frame.
@@ -21,8 +25,10 @@ struct VolumeSettings {
 
 /// The volume of a scene: z of the grid is up, yaw follows the walls (strongest direction of the
 /// horizontal surface normals), the box holds the seen points (0.5 % outliers trimmed at each side)
-/// and the cameras, grown by the margins; bounds are multiples of 4 voxels. Decision 2 of the design.
-/// Throws Error if no view has a usable depth or the volume would exceed 4,096 voxels a side.
+/// and the cameras, grown by the margins; bounds are multiples of 4 voxels. The grid's origin is
+/// the world's. With `bounds`, the grid keeps the world's heading: a turned box would be larger
+/// than was asked for. Decision 2 of the design. Throws Error if no view has a usable depth or the
+/// volume would exceed 4,096 voxels a side.
 VoxelFrame fitVolume(const std::vector<DepthView>& views, const VolumeSettings& settings,
                      const CarveSettings& carving);
 
@@ -39,14 +45,18 @@ struct SceneVoxels {
 };
 
 /// Writes standard 5-4-3 grids: surface (level set), density (fog), Cd (vec3s), observed, generated
-/// (bool), probability, bfs_level (float); world transform with the grid's rotation; metadata as
-/// formats.md 2.3. Voxel ijk's centre is at ijk + 0.5 in frame units: the file's transform has the
-/// half-voxel shift so that grid index space is cell-centred. Written to a temporary name and renamed.
-/// Throws Error where the file cannot be written.
+/// (bool), probability, bfs_level (float), seen_empty (bool); world transform with the grid's
+/// rotation; metadata as formats.md 2.3. Voxel ijk's centre is at ijk + 0.5 in frame units: the
+/// file's transform has the half-voxel shift so that grid index space is cell-centred. `surface` is
+/// the exact distance to the boundary of the voxels; generated ones that lie in `empty` are left
+/// out of it. A checksum follows what OpenVDB reads. Written to a temporary name and renamed.
+/// Throws Error for voxels outside the bounds, twice the same, or with values that are not finite,
+/// and where the file cannot be written.
 void writeSceneVdb(const SceneVoxels& voxels, const std::string& path);
 
-/// Reads back what writeSceneVdb wrote (all but `surface`, which is derived). Throws Error on files
-/// that are missing, corrupt or lack the grids.
+/// Reads back what writeSceneVdb wrote (all but `surface`, which is derived), voxels in the order
+/// of the file's tree. Also when another program wrote the file again. Throws Error on files that
+/// are missing, corrupt, lack the grids or say what cannot be.
 SceneVoxels readSceneVdb(const std::string& path);
 
 }  // namespace vdbc

@@ -12,6 +12,7 @@
 
 #include <array>
 #include <cstdint>
+#include <memory>
 #include <vector>
 
 namespace vdbc {
@@ -20,12 +21,21 @@ using openvdb::Coord;
 using openvdb::CoordBBox;
 
 template <typename T>
-using ComputeTree = openvdb::tree::Tree<openvdb::tree::RootNode<openvdb::tree::InternalNode<
-    openvdb::tree::InternalNode<openvdb::tree::LeafNode<T, 1>, 1>, 5>>>;
+using ComputeTree = openvdb::tree::Tree<openvdb::tree::RootNode<
+    openvdb::tree::InternalNode<openvdb::tree::InternalNode<openvdb::tree::LeafNode<T, 1>, 1>, 5>>>;
 
-/// Topology of a set of voxels or, by its tiles, nodes (active states only).
+/// Topology of a set of voxels or, by its tiles, nodes (active states only). OpenVDB deletes the
+/// assignment of trees: write `to.root() = from.root()`.
 using TokenMask = ComputeTree<openvdb::ValueMask>;
 using TokenIndexTree = ComputeTree<openvdb::Int32>;
+
+}  // namespace vdbc
+
+// Instantiated in grid_instances.cpp: every file that owns one would otherwise compile its vtable.
+extern template class openvdb::tree::Tree<vdbc::TokenMask::RootNodeType>;
+extern template class openvdb::tree::Tree<vdbc::TokenIndexTree::RootNodeType>;
+
+namespace vdbc {
 
 constexpr int kTokenLevels = 3;  // voxel, latent, coarse
 
@@ -44,9 +54,9 @@ inline Coord childCoord(const Coord& parent, int slot) {
                parent.z() * 2 + (slot & 1));
 }
 
-/// Rows of all tokens of a voxel topology and the maps between levels. Rows of each level are in tree
-/// iteration order, so the rows of a node's children are consecutive. Immutable after construction.
-/// Spec: E4, E8.
+/// Rows of all tokens of a voxel topology and the maps between levels. Rows of each level are in
+/// tree iteration order, so the rows of a node's children are consecutive. Immutable after
+/// construction. Spec: E4, E8.
 class TokenGrid {
  public:
   TokenGrid() = default;
@@ -68,7 +78,9 @@ class TokenGrid {
   int32_t row(int level, const Coord& ijk) const;
 
  private:
-  TokenIndexTree tree_{-1};  // voxel rows; a node's row is its first child's parent
+  // Voxel rows; a node's row is its first child's parent. Shared by copies: it never changes (and
+  // OpenVDB's trees cannot be assigned).
+  std::shared_ptr<const TokenIndexTree> tree_;
   std::array<std::vector<Coord>, kTokenLevels> coords_;
   std::array<std::vector<int32_t>, kTokenLevels - 1> parents_;
   std::array<std::vector<std::array<int32_t, 8>>, kTokenLevels - 1> children_;

@@ -1,0 +1,186 @@
+#include "encoder/layers.h"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+namespace vdbc {
+
+namespace nn = torch::nn;
+
+Tensor coordTensor(const std::vector<Coord>& coords) {
+  static_assert(sizeof(Coord) == 3 * sizeof(int32_t), "Coord is three packed int32");
+  Tensor t = torch::empty({int64_t(coords.size()), 3}, torch::kInt32);
+  if (!coords.empty()) std::memcpy(t.data_ptr(), coords.data(), coords.size() * sizeof(Coord));
+  return t;
+}
+
+namespace {
+// Spreads the low 21 bits of v so that two zero bits follow each.
+uint64_t spreadBits(uint64_t v) {
+  v &= 0x1fffff;
+  v = (v | v << 32) & 0x1f00000000ffffull;
+  v = (v | v << 16) & 0x1f0000ff0000ffull;
+  v = (v | v << 8) & 0x100f00f00f00f00full;
+  v = (v | v << 4) & 0x10c30c30c30c30c3ull;
+  return (v | v << 2) & 0x1249249249249249ull;
+}
+}  // namespace
+
+Tensor zOrder(const std::vector<Coord>& coords) {
+  constexpr int kOffset = 1 << 20;  // makes negative coordinates positive
+  std::vector<uint64_t> key(coords.size());
+  for (size_t i = 0; i < coords.size(); ++i)
+    key[i] = spreadBits(uint64_t(coords[i].x() + kOffset)) << 2 |
+             spreadBits(uint64_t(coords[i].y() + kOffset)) << 1 |
+             spreadBits(uint64_t(coords[i].z() + kOffset));
+  Tensor order = torch::empty({int64_t(coords.size())}, torch::kInt64);
+  int64_t* o = order.data_ptr<int64_t>();
+  std::iota(o, o + coords.size(), 0);
+  std::sort(o, o + coords.size(), [&](int64_t a, int64_t b) {
+    return key[size_t(a)] != key[size_t(b)] ? key[size_t(a)] < key[size_t(b)] : a < b;
+  });
+  return order;
+}
+
+Rotary rotary(const Tensor& coords, int head_dim) {
+  constexpr int kFrequencies = 5;
+  const int64_t n = coords.size(0), pairs = head_dim / 2;
+  const int used = int(std::min<int64_t>(kFrequencies, pairs / 3));
+  std::vector<float> f(size_t(used), 1.5f);
+  for (int i = 1; i < used; ++i) f[size_t(i)] = 1.5f * std::pow(.094f / 1.5f, float(i) / float(used - 1));
+  const Tensor frequencies = torch::tensor(f);
+  Tensor angle = coords.to(torch::kFloat32).unsqueeze(2) * frequencies;  // [N, 3, used]
+  angle = torch::cat({angle.reshape({n, 3 * used}), torch::zeros({n, pairs - 3 * used})}, 1);
+  return {angle.cos(), angle.sin()};
+}
+
+Tensor rotate(const Tensor& x, const Rotary& p) {
+  const auto halves = x.chunk(2, -1);
+  return torch::cat({halves[0] * p.cos - halves[1] * p.sin, halves[0] * p.sin + halves[1] * p.cos}, -1);
+}
+
+Tensor sinusoidalCode(const Tensor& positions) {
+  const Tensor octaves = torch::pow(2.f, torch::arange(6, torch::kFloat32)) * float(M_PI / 2);
+  const Tensor angle = (positions.unsqueeze(2) * octaves).reshape({positions.size(0), 18});
+  return torch::cat({angle.sin(), angle.cos()}, 1);
+}
+
+Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame) {
+  constexpr float kExtent = 12.8f;  // metres; larger places go beyond +-.5 and the code still differs
+  const Coord lo = frame.bounds.min(), hi = frame.bounds.max();
+  const Tensor origin = torch::tensor({float(lo.x() + hi.x() + 1) / 2 * frame.voxel_m,
+                                       float(lo.y() + hi.y() + 1) / 2 * frame.voxel_m,
+                                       float(lo.z()) * frame.voxel_m});
+  return (metres - origin) / kExtent;
+}
+
+Tensor tokenPositions(const Tensor& coords, int level, const VoxelFrame& frame) {
+  const float token_m = frame.voxel_m * float(1 << level);
+  return normalisedPositions((coords.to(torch::kFloat32) + .5f) * token_m, frame);
+}
+
+Attention::Attention(int width, int heads_) : heads(heads_) {
+  query = register_module("query", nn::Linear(width, width));
+  key = register_module("key", nn::Linear(width, width));
+  value = register_module("value", nn::Linear(width, width));
+  output = register_module("output", nn::Linear(width, width));
+}
+
+namespace {
+Tensor splitHeads(const Tensor& x, int heads) {  // [N, C] -> [H, N, C / H]
+  return x.view({x.size(0), heads, -1}).transpose(0, 1);
+}
+}  // namespace
+
+Tensor Attention::attend(const Tensor& q_rows, const Tensor& k_rows, const Tensor& v_rows,
+                         const Rotary* q_pos, const Rotary* k_pos) const {
+  Tensor q = splitHeads(q_rows, heads), k = splitHeads(k_rows, heads), v = splitHeads(v_rows, heads);
+  if (q_pos) q = rotate(q, *q_pos);
+  if (k_pos) k = rotate(k, *k_pos);
+  const double scale = 1 / std::sqrt(double(q.size(2)));
+  const Tensor a = torch::matmul(q * scale, k.transpose(1, 2)).softmax(-1);
+  return torch::matmul(a, v).transpose(0, 1).reshape({q_rows.size(0), q_rows.size(1)});
+}
+
+Tensor Attention::forward(const Tensor& x, const Tensor& context, const Rotary* x_pos,
+                          const Rotary* context_pos) {
+  return output->forward(
+      attend(query->forward(x), key->forward(context), value->forward(context), x_pos, context_pos));
+}
+
+Tensor Attention::windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,
+                           bool shifted) {
+  const int64_t n = x.size(0), width = x.size(1);
+  if (n <= window) return forward(x, x, pos, pos);
+  // Rows in curve order; a shifted layer starts half a window earlier, so its first and last windows
+  // are half empty. Places without a token are masked.
+  const int64_t lead = shifted ? window / 2 : 0;
+  const int64_t windows = (n + lead + window - 1) / window;
+  const int64_t tail = windows * window - lead - n;
+  auto toWindows = [&](const Tensor& rows) {  // [N, C] -> [windows * H, window, C / H]
+    const Tensor padded = torch::constant_pad_nd(rows, {0, 0, lead, tail});
+    return padded.view({windows, window, heads, -1}).transpose(1, 2).reshape({windows * heads, window, -1});
+  };
+  const Tensor sorted = x.index_select(0, order);
+  auto headed = [&](const Tensor& rows) {
+    if (!pos) return rows;
+    const Rotary p = pos->select(order);
+    return rotate(splitHeads(rows, heads), p).transpose(0, 1).reshape({n, width});
+  };
+  const Tensor q = toWindows(headed(query->forward(sorted)));
+  const Tensor k = toWindows(headed(key->forward(sorted)));
+  const Tensor v = toWindows(value->forward(sorted));
+  Tensor blocked = torch::zeros({windows, 1, 1, window});
+  if (lead) blocked.index_put_({0, 0, 0, torch::arange(lead)}, -1e9f);
+  if (tail) blocked.index_put_({windows - 1, 0, 0, torch::arange(window - tail, window)}, -1e9f);
+  const double scale = 1 / std::sqrt(double(q.size(2)));
+  Tensor a = torch::matmul(q * scale, k.transpose(1, 2)).view({windows, heads, window, window});
+  a = (a + blocked).softmax(-1).view({windows * heads, window, window});
+  const Tensor out = torch::matmul(a, v).view({windows, heads, window, -1}).transpose(1, 2)
+                         .reshape({windows * window, width})
+                         .slice(0, lead, lead + n);
+  Tensor inverse = torch::empty_like(order);
+  inverse.index_put_({order}, torch::arange(n));
+  return output->forward(out.index_select(0, inverse));
+}
+
+Mlp::Mlp(int in, int hidden, int out) {
+  first = register_module("first", nn::Linear(in, hidden));
+  second = register_module("second", nn::Linear(hidden, out));
+}
+
+SelfBlock::SelfBlock(int width, int heads) {
+  norm1 = register_module("norm1", nn::LayerNorm(nn::LayerNormOptions({width})));
+  norm2 = register_module("norm2", nn::LayerNorm(nn::LayerNormOptions({width})));
+  attention = register_module("attention", std::make_shared<Attention>(width, heads));
+  mlp = register_module("mlp", std::make_shared<Mlp>(width, 4 * width, width));
+}
+
+Tensor SelfBlock::forward(Tensor x, const Rotary* pos, const Tensor& order, int window, bool shifted) {
+  x = x + attention->windowed(norm1->forward(x), pos, order, window, shifted);
+  return x + mlp->forward(norm2->forward(x));
+}
+
+void initialiseXavier(nn::Module& module) {
+  torch::NoGradGuard no_grad;
+  for (auto& m : module.modules(/*include_self=*/false))
+    if (auto* linear = m->as<nn::LinearImpl>()) {
+      const double bound = std::sqrt(6.0 / double(linear->weight.size(0) + linear->weight.size(1)));
+      linear->weight.uniform_(-bound, bound);
+      if (linear->bias.defined()) linear->bias.zero_();
+    }
+}
+
+void updateAverage(std::vector<Tensor>& average, const std::vector<Tensor>& parameters, double decay) {
+  torch::NoGradGuard no_grad;
+  for (size_t i = 0; i < average.size(); ++i) average[i].lerp_(parameters[i], 1 - decay);
+}
+
+double cosineRate(double base, int64_t step, int64_t steps, int64_t warmup, double floor) {
+  if (step < warmup) return base * double(step + 1) / double(warmup);
+  const double t = std::min(1.0, double(step - warmup) / double(std::max<int64_t>(1, steps - warmup)));
+  return base * (floor + (1 - floor) * .5 * (1 + std::cos(M_PI * t)));
+}
+
+}  // namespace vdbc

@@ -1,0 +1,99 @@
+#pragma once
+// Private: transformer layers shared by encoder/ and mar/, and the only place (with
+// rasterize_torch.h) that includes torch. This header is precompiled.
+#include <torch/nn/module.h>
+#include <torch/nn/modules/activation.h>
+#include <torch/nn/modules/container/modulelist.h>
+#include <torch/nn/modules/container/sequential.h>
+#include <torch/nn/modules/linear.h>
+#include <torch/nn/modules/normalization.h>
+#include <torch/types.h>
+
+#include "vdb/carve.h"
+#include "vdb/token_grid.h"
+
+namespace vdbc {
+
+using torch::Tensor;
+
+/// Coordinates as an int32 tensor [N, 3].
+Tensor coordTensor(const std::vector<Coord>& coords);
+
+/// Z-order of coordinates: order[k] is the row at place k of the curve. Neighbours on the curve are
+/// neighbours in space, which is what windowed attention needs.
+Tensor zOrder(const std::vector<Coord>& coords);
+
+/// Cosines and sines of 3-D rotary positions, each [N, head_dim / 2]: 5 frequencies an axis, 1.5 to
+/// .094 rad a voxel, geometric; pairs left over do not turn. Spec A5.
+struct Rotary {
+  Tensor cos, sin;
+  Rotary select(const Tensor& rows) const {
+    return {cos.index_select(0, rows), sin.index_select(0, rows)};
+  }
+};
+Rotary rotary(const Tensor& coords, int head_dim);
+
+/// Rotates [H, N, head_dim] by the positions of its N tokens.
+Tensor rotate(const Tensor& x, const Rotary& positions);
+
+/// Sinusoidal code of positions [N, 3] (any unit; about 0-1 over the training extent), [N, 6 * 6].
+Tensor sinusoidalCode(const Tensor& positions);
+constexpr int kSinusoidalDim = 36;
+
+/// Positions in metres (grid axes) divided by the training extent: about -.5..+.5 across, 0-.4 up.
+Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame);
+/// The same of the centres of tokens [N, 3] int32 of a tree level.
+Tensor tokenPositions(const Tensor& coords, int level, const VoxelFrame& frame);
+
+/// Multi-head attention with separate q, k, v and output projections.
+struct Attention : torch::nn::Module {
+  Attention(int width, int heads);
+  /// Queries [N, C], keys and values from [M, C]; rotary positions may be empty. Returns [N, C].
+  Tensor forward(const Tensor& x, const Tensor& context, const Rotary* x_pos = nullptr,
+                 const Rotary* context_pos = nullptr);
+  /// Self-attention of [N, C] within windows of `window` tokens consecutive in `order` (Z-order),
+  /// every second layer shifted by half a window. Full attention where N <= window.
+  Tensor windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window, bool shifted);
+  /// alpha * attention + (1 - alpha) * guide, mixed before the output projection; `guide` maps values
+  /// [M, C] to [N, C] (spec E7).
+  template <typename Guide>
+  Tensor guided(const Tensor& x, const Tensor& context, const Tensor& alpha, const Guide& guide) {
+    const Tensor v = value->forward(context);
+    return output->forward(alpha * attend(query->forward(x), key->forward(context), v, nullptr, nullptr) +
+                           (1 - alpha) * guide(v));
+  }
+
+  int heads;
+  torch::nn::Linear query{nullptr}, key{nullptr}, value{nullptr}, output{nullptr};
+
+ private:
+  Tensor attend(const Tensor& q, const Tensor& k, const Tensor& v, const Rotary* q_pos,
+                const Rotary* k_pos) const;
+};
+
+/// Linear, GELU, linear.
+struct Mlp : torch::nn::Module {
+  Mlp(int in, int hidden, int out);
+  Tensor forward(const Tensor& x) { return second->forward(torch::gelu(first->forward(x))); }
+  torch::nn::Linear first{nullptr}, second{nullptr};
+};
+
+/// Pre-norm transformer block: self-attention (windowed, rotary) and MLP.
+struct SelfBlock : torch::nn::Module {
+  SelfBlock(int width, int heads);
+  Tensor forward(Tensor x, const Rotary* pos, const Tensor& order, int window, bool shifted);
+  torch::nn::LayerNorm norm1{nullptr}, norm2{nullptr};
+  std::shared_ptr<Attention> attention;
+  std::shared_ptr<Mlp> mlp;
+};
+
+/// Xavier for matrices, zeros for biases (spec E13); modules that must start at zero do so afterwards.
+void initialiseXavier(torch::nn::Module& module);
+
+/// Exponential moving average of parameters: average += (1 - decay) * (value - average).
+void updateAverage(std::vector<Tensor>& average, const std::vector<Tensor>& parameters, double decay);
+
+/// base * (linear warm-up, then cosine from 1 to `floor`). Spec E13, A14.
+double cosineRate(double base, int64_t step, int64_t steps, int64_t warmup, double floor);
+
+}  // namespace vdbc

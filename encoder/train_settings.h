@@ -1,0 +1,39 @@
+#pragma once
+// How long and how to train; shared by the encoder's and the completer's training.
+#include <cstdint>
+#include <functional>
+#include <map>
+#include <string>
+#include <vector>
+
+#include "splat/view.h"
+
+namespace vdbc {
+
+/// All views of scene `index`; the same views for the same index. Called from one thread at a time,
+/// not the caller's. Training knows nothing else about where scenes come from.
+using SceneSource = std::function<std::vector<View>(uint64_t index)>;
+
+struct TrainSettings {
+  std::string weights_path;     // result: averaged weights (safetensors)
+  std::string work_folder;      // checkpoint, log.csv, validation pictures
+  int64_t steps = 4000;
+  double learning_rate = 8e-4;  // peak; linear warm-up, then cosine to 2 %
+  int64_t warmup = 150;
+  double average_decay = .998;  // of the exponential moving average that is shipped
+  double clip_norm = 1;
+  int64_t validate_every = 250;
+  int64_t checkpoint_every = 250;
+  uint64_t seed = 1;
+  bool resume = false;
+  std::map<std::string, std::string> metadata;  // goes into the weights: scenes trained on, ...
+};
+
+/// One line of the log: what `validate_every` steps gave.
+struct TrainLogRow {
+  int64_t step = 0;
+  std::map<std::string, double> values;
+};
+using TrainListener = std::function<void(const TrainLogRow&)>;
+
+}  // namespace vdbc

@@ -1,0 +1,179 @@
+#include "houdini_style_tools/complete.h"
+
+#include <unistd.h>
+
+#include <algorithm>
+#include <cmath>
+#include <filesystem>
+
+#include "splat/rasterize.h"
+
+namespace vdbc {
+
+namespace fs = std::filesystem;
+
+Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
+                         const Completer& completer, const SceneSettings& settings,
+                         Progress& progress) {
+  VolumeSettings volume = settings.volume;
+  volume.voxel_m = encoder.config().voxel_m;
+  ObservationSettings observing = encoder.observationSettings();
+  observing.carving = settings.carving;
+  std::vector<DepthView> depth;
+  for (const View& v : views) depth.push_back(v.depthView());
+
+  progress.start("carve");
+  const VoxelFrame frame = fitVolume(depth, volume, settings.carving);
+  Completion c{observe(views, frame, observing, progress), {}, {}, {}, {}};
+  progress.end();
+  progress.start("encode");
+  c.seen = encoder.encode(views, c.observation, progress);
+  progress.end();
+  c.whole = completer.complete(c.seen, c.observation.space, settings.completion, progress);
+  progress.start("decode");
+  c.seen_decoded = encoder.decode(c.seen, c.observation.space, settings.child_threshold, progress);
+  c.whole_decoded = encoder.decode(c.whole, c.observation.space, settings.child_threshold, progress);
+  progress.end();
+  return c;
+}
+
+SceneVoxels sceneVoxels(const DecodedGrid& d, const LatentGrid& latents, const ObservedSpace& space) {
+  SceneVoxels v;
+  v.frame = latents.frame;
+  v.ijk = d.voxels;
+  v.empty.root() = space.empty.root();
+  const size_t n = d.voxels.size(), m = n ? size_t(d.gaussians.size()) / n : 0;
+  openvdb::tree::ValueAccessor<const TokenMask> filled(space.filled);
+  for (size_t i = 0; i < n; ++i) {
+    Eigen::Vector3f colour = Eigen::Vector3f::Zero();
+    float weight = 0, clear = 1;
+    for (size_t g = i * m; g < (i + 1) * m; ++g) {
+      const float opacity = 1 / (1 + std::exp(-d.gaussians.opacity_logit[g]));
+      for (int c = 0; c < 3; ++c)
+        colour[c] += opacity * std::clamp(.5f + kSh0 * d.gaussians.sh[3 * g + size_t(c)], 0.f, 1.f);
+      weight += opacity;
+      clear *= 1 - opacity;
+    }
+    colour /= std::max(weight, 1e-6f);
+    v.colour_linear.emplace_back(linearFromSrgb(colour[0]), linearFromSrgb(colour[1]), linearFromSrgb(colour[2]));
+    v.density.push_back(1 - clear);
+    const size_t node = size_t(d.node[i]);
+    // A voxel was observed if a pixel's point lies in it; an observed token may gain unseen voxels.
+    const bool observed = filled.isValueOn(d.voxels[i]);
+    v.observed.push_back(observed);
+    v.probability.push_back(observed ? 1.f : latents.probability[node] * d.child_probability[i]);
+    v.bfs_level.push_back(observed ? 0 : std::max(1, latents.bfs_level[node]));
+  }
+  return v;
+}
+
+Provenance gaussianProvenance(const SceneVoxels& voxels, int64_t per_voxel) {
+  Provenance p;
+  for (size_t i = 0; i < voxels.ijk.size(); ++i)
+    for (int64_t g = 0; g < per_voxel; ++g) {
+      p.generated.push_back(!voxels.observed[i]);
+      p.probability.push_back(voxels.probability[i]);
+    }
+  return p;
+}
+
+namespace {
+
+constexpr int kTileWidth = 320;
+
+void paste(const Image& from, int x0, int y0, Image* to) {
+  for (int y = 0; y < from.height; ++y)
+    for (int x = 0; x < from.width; ++x)
+      for (int c = 0; c < 3; ++c) to->at(x0 + x, y0 + y, c) = from.at(x, y, c);
+}
+
+// From the mean camera place, four level headings, the first as the first view looks.
+std::vector<Camera> novelCameras(const std::vector<View>& views, const Eigen::Vector3d& up, int width,
+                                 int height) {
+  Eigen::Vector3d place = Eigen::Vector3d::Zero();
+  for (const View& v : views) place += v.camera.world_from_camera.translation() / double(views.size());
+  Eigen::Vector3d forward = views[0].camera.world_from_camera.linear().col(2);
+  forward -= up * forward.dot(up);
+  if (forward.norm() < 1e-3) forward = up.unitOrthogonal();
+  forward.normalize();
+  std::vector<Camera> cameras;
+  for (int i = 0; i < 4; ++i) {
+    Camera c;
+    c.width = width, c.height = height;
+    c.fx = c.fy = width / (2 * std::tan(.5 * 80 * M_PI / 180));  // 80 degrees across
+    c.cx = width / 2., c.cy = height / 2.;
+    const Eigen::Vector3d z = Eigen::AngleAxisd(i * M_PI / 2, up) * forward, x = z.cross(up).normalized();
+    c.world_from_camera.linear() << x, z.cross(x), z;
+    c.world_from_camera.translation() = place;
+    cameras.push_back(c);
+  }
+  return cameras;
+}
+
+}  // namespace
+
+Image contactSheet(const std::vector<View>& views, const Completion& completion, const Eigen::Vector3d& up) {
+  const int columns = 4, shown = std::min(columns, int(views.size()));
+  const int height = int(std::lround(double(kTileWidth) * views[0].camera.height / views[0].camera.width));
+  Image sheet(columns * kTileWidth, 3 * height, 3, .15f);
+  for (int i = 0; i < shown; ++i) {
+    const Camera& c = views[size_t(i)].camera;
+    const double shrink = std::min(double(kTileWidth) / c.width, double(height) / c.height);
+    paste(resizeImage(views[size_t(i)].colour, std::max(1, int(c.width * shrink)), std::max(1, int(c.height * shrink))),
+          i * kTileWidth, 0, &sheet);
+  }
+  const std::vector<Camera> cameras = novelCameras(views, up, kTileWidth, height);
+  for (int i = 0; i < columns; ++i) {
+    paste(rasterize(completion.seen_decoded.gaussians, cameras[size_t(i)], {}).colour, i * kTileWidth, height, &sheet);
+    paste(rasterize(completion.whole_decoded.gaussians, cameras[size_t(i)], {}).colour, i * kTileWidth, 2 * height, &sheet);
+  }
+  return sheet;
+}
+
+std::string outputStem(const std::string& path) {
+  const fs::path p(path);
+  if (p.extension() != ".vdb" || p.stem().empty())
+    throw UsageError(joinText("--output: ", path, ": expected a name that ends in .vdb"));
+  const fs::path folder = p.has_parent_path() ? p.parent_path() : fs::path(".");
+  if (!fs::exists(folder)) {
+    std::error_code error;
+    fs::create_directories(folder, error);
+    require(!error, "--output: ", folder.string(), ": cannot create the folder: ", error.message());
+  }
+  require(fs::is_directory(folder), "--output: ", folder.string(), ": expected a folder");
+  // Asking the file system beats access(): root may pass access() on a read-only mount.
+  const std::string probe = (folder / (p.stem().string() + ".probe.tmp")).string();
+  std::FILE* f = std::fopen(probe.c_str(), "wb");
+  require(f != nullptr, "--output: ", folder.string(), ": the folder is not writable");
+  std::fclose(f);
+  std::remove(probe.c_str());
+  return (folder / p.stem()).string();
+}
+
+void writeCompletion(const std::vector<View>& views, const Completion& c, const std::string& stem,
+                     const Eigen::Vector3d& up, Progress& progress) {
+  progress.start("write");
+  const SceneVoxels voxels = sceneVoxels(c.whole_decoded, c.whole, c.observation.space);
+  const Gaussians& g = c.whole_decoded.gaussians;
+  const int64_t per_voxel = voxels.ijk.empty() ? 0 : g.size() / int64_t(voxels.ijk.size());
+  const std::vector<std::string> endings = {".points.vdb", ".ply", ".png", ".vdb"};
+  // Everything under other names first: all four files appear, or none.
+  const std::string draft = stem + ".draft";
+  try {
+    writePointsVdb(g, gaussianProvenance(voxels, per_voxel), draft + endings[0]);
+    report(progress, 30);
+    writePly(g, draft + endings[1], up.cast<float>());
+    report(progress, 50);
+    writePng(contactSheet(views, c, up), draft + endings[2]);
+    report(progress, 70);
+    writeSceneVdb(voxels, draft + endings[3]);
+    for (const std::string& ending : endings) fs::rename(draft + ending, stem + ending);
+  } catch (...) {
+    std::error_code ignored;
+    for (const std::string& ending : endings) fs::remove(draft + ending, ignored);
+    throw;
+  }
+  progress.end();
+}
+
+}  // namespace vdbc

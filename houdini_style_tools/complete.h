@@ -1,0 +1,51 @@
+#pragma once
+// The main job: views in, completed place out.
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "encoder/encoder.h"
+#include "mar/completer.h"
+#include "vdb/scene_volume.h"
+
+namespace vdbc {
+
+struct SceneSettings {
+  VolumeSettings volume;          // voxel size comes from the encoder's weights
+  CarveSettings carving;
+  CompleteSettings completion;
+  float child_threshold = .5f;    // of BCE-up, for voxels that were not observed
+};
+
+/// A completed place, before it is written.
+struct Completion {
+  Observation observation;
+  LatentGrid seen, whole;         // latents of the observed tokens; the same and generated ones
+  DecodedGrid seen_decoded, whole_decoded;
+};
+
+/// Carves, encodes, completes, decodes. Observed tokens of `whole` are bit-identical to `seen`.
+Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
+                         const Completer& completer, const SceneSettings& settings,
+                         Progress& progress);
+
+/// Voxels with colour, density and provenance, from decoded content.
+SceneVoxels sceneVoxels(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space);
+/// Provenance of each Gaussian.
+Provenance gaussianProvenance(const SceneVoxels& voxels, int64_t gaussians_per_voxel);
+
+/// Picture: a row of input views, then for novel views (the mean camera place, four headings) a row as
+/// observed and a row as completed.
+Image contactSheet(const std::vector<View>& views, const Completion& completion,
+                   const Eigen::Vector3d& up);
+
+/// Throws Error unless X.vdb can be created beside its siblings; called before any long work.
+/// Returns X of an output path X.vdb.
+std::string outputStem(const std::string& vdb_path);
+
+/// X.vdb, X.points.vdb, X.ply and X.png. All are written to temporary names; a failure leaves none of
+/// this run's files behind.
+void writeCompletion(const std::vector<View>& views, const Completion& completion, const std::string& stem,
+                     const Eigen::Vector3d& up, Progress& progress);
+
+}  // namespace vdbc

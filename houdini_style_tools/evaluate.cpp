@@ -1,0 +1,297 @@
+#include "houdini_style_tools/evaluate.h"
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <fstream>
+#include <limits>
+#include <map>
+#include <nlohmann/json.hpp>
+#include <numeric>
+#include <random>
+#include <set>
+
+#include "examples/rooms/rooms.h"
+#include "houdini_style_tools/scenes.h"
+#include "splat/rasterize.h"
+
+namespace vdbc {
+namespace {
+
+constexpr int kTargetViews = 8;
+constexpr int kLeakRays = 8192;
+constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
+
+double secondsSince(std::chrono::steady_clock::time_point start) {
+  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+}
+
+// The kernel keeps the peak; writing 5 to clear_refs starts it afresh (Linux).
+void resetPeakMemory() { std::ofstream("/proc/self/clear_refs") << "5"; }
+double peakMemoryMb() {
+  std::ifstream status("/proc/self/status");
+  for (std::string line; std::getline(status, line);)
+    if (line.rfind("VmHWM:", 0) == 0) return std::atof(line.c_str() + 6) / 1024;
+  return kNan;
+}
+
+// What a method made: Gaussians to look at, voxels to trace and to count.
+struct MethodOutput {
+  Gaussians gaussians;
+  std::vector<Coord> voxels;
+};
+
+EvaluationScene roomScene(uint64_t seed, int views) {
+  requireHeldOut(seed);
+  EvaluationScene s;
+  s.name = "rooms:" + std::to_string(seed);
+  const Room room = makeRoom(seed);
+  const RoomRenderer renderer(room);
+  std::mt19937_64 random(seed);
+  int i = 0;
+  for (const Camera& camera : randomCameras(room, views + kTargetViews, kRoomSide, kRoomSide, random)) {
+    (i < views ? s.input : s.targets).push_back(renderer.render(camera, 4 * kRoomSamples, seed + uint64_t(i)));
+    ++i;
+  }
+  s.truth = room.mesh;
+  s.free_points = freePoints(room, 64, seed);
+  return s;
+}
+
+EvaluationScene folderScene(const std::string& folder, int views, uint64_t seed) {
+  EvaluationScene s;
+  s.name = folder;
+  s.up = conventionalUp(folder);
+  std::vector<View> all = readViews(folder);
+  require(int(all.size()) > views, "eval: ", folder, ": expected more than ", views, " frames, found ", all.size());
+  std::mt19937_64 random(seed);
+  for (size_t i = all.size() - 1; i > 0; --i) std::swap(all[i], all[random() % (i + 1)]);
+  s.input.assign(all.begin(), all.begin() + views);
+  s.targets.assign(all.begin() + views, all.end());
+  return s;
+}
+
+// An opaque-looking Gaussian for a cube of the grid.
+void addCube(const VoxelFrame& frame, const Eigen::Vector3d& centre_index, float edge_m,
+             const Eigen::Vector3f& srgb, Gaussians* g) {
+  g->mean.push_back(frame.toWorld(centre_index).cast<float>());
+  g->log_scale.push_back(Eigen::Vector3f::Constant(std::log(.5f * edge_m)));
+  g->rotation.emplace_back(1, 0, 0, 0);
+  g->opacity_logit.push_back(5);
+  for (int c = 0; c < 3; ++c) g->sh.push_back((srgb[c] - .5f) / kSh0);
+}
+
+Eigen::Vector3f meanColour(const SceneVoxels& voxels) {
+  Eigen::Vector3f sum = Eigen::Vector3f::Zero();
+  for (const auto& c : voxels.colour_linear)
+    sum += Eigen::Vector3f(srgbFromLinear(c[0]), srgbFromLinear(c[1]), srgbFromLinear(c[2]));
+  return sum / float(std::max<size_t>(1, voxels.colour_linear.size()));
+}
+
+void addVoxelsOfNode(const Coord& node, std::vector<Coord>* voxels) {
+  for (int slot = 0; slot < 8; ++slot) voxels->push_back(childCoord(node, slot));
+}
+
+// Every unobserved node of the volume takes the colour of the nearest observed voxel. The nearest one is
+// found by growing from the observed nodes, ring by ring.
+MethodOutput nearestFill(const MethodOutput& observed, const SceneVoxels& seen, const NodeStates& states) {
+  MethodOutput out = observed;
+  std::map<Coord, Eigen::Vector3f> colour;
+  for (size_t i = 0; i < seen.ijk.size(); ++i) {
+    const auto& c = seen.colour_linear[i];
+    colour.emplace(tokenCoord(seen.ijk[i], 1),
+                   Eigen::Vector3f(srgbFromLinear(c[0]), srgbFromLinear(c[1]), srgbFromLinear(c[2])));
+  }
+  std::vector<Coord> ring;
+  for (const auto& entry : colour) ring.push_back(entry.first);
+  while (!ring.empty()) {
+    std::map<Coord, Eigen::Vector3f> next;
+    for (const Coord& c : ring)
+      for (int axis = 0; axis < 3; ++axis)
+        for (int step : {-1, 1}) {
+          Coord n = c;
+          n[axis] += step;
+          if (states.box.isInside(n) && !colour.count(n)) next.emplace(n, colour.at(c));
+        }
+    ring.clear();
+    for (const auto& [node, value] : next) {
+      colour.emplace(node, value);
+      ring.push_back(node);
+    }
+  }
+  for (auto node = states.box.begin(); node; ++node) {
+    if (states.at(*node) != NodeState::kUnobserved) continue;
+    const Eigen::Vector3d centre(2. * (*node).x() + 1, 2. * (*node).y() + 1, 2. * (*node).z() + 1);
+    addCube(seen.frame, centre, 2 * seen.frame.voxel_m, colour.at(*node), &out.gaussians);
+    addVoxelsOfNode(*node, &out.voxels);
+  }
+  return out;
+}
+
+// Floor, ceiling and walls fitted to what was seen (the box of the seen voxels, a half per cent trimmed at
+// each side); its unobserved nodes take the mean colour.
+MethodOutput manhattanBox(const MethodOutput& observed, const SceneVoxels& seen, const NodeStates& states) {
+  MethodOutput out = observed;
+  Coord lo, hi;
+  for (int axis = 0; axis < 3; ++axis) {
+    std::vector<int> values;
+    for (const Coord& v : seen.ijk) values.push_back(v[axis]);
+    std::sort(values.begin(), values.end());
+    const size_t trim = values.size() / 200;
+    lo[axis] = values[trim] >> 1, hi[axis] = values[values.size() - 1 - trim] >> 1;
+  }
+  const Eigen::Vector3f colour = meanColour(seen);
+  const CoordBBox box(lo, hi);
+  for (auto i = box.begin(); i; ++i) {
+    const Coord node = *i;
+    const bool face = node.x() == lo.x() || node.x() == hi.x() || node.y() == lo.y() || node.y() == hi.y() ||
+                      node.z() == lo.z() || node.z() == hi.z();
+    if (!face || states.at(node) != NodeState::kUnobserved) continue;
+    addCube(seen.frame, Eigen::Vector3d(2. * node.x() + 1, 2. * node.y() + 1, 2. * node.z() + 1),
+            2 * seen.frame.voxel_m, colour, &out.gaussians);
+    addVoxelsOfNode(node, &out.voxels);
+  }
+  return out;
+}
+
+MethodResult measure(const std::string& method, const EvaluationScene& scene, const MethodOutput& output,
+                     const VoxelFrame& frame, const NodeStates& states) {
+  MethodResult r;
+  r.scene = scene.name, r.method = method, r.views = int(scene.input.size());
+  r.gaussians = output.gaussians.size();
+  r.psnr = r.ssim = 0;
+  for (const View& target : scene.targets) {
+    Image image = rasterize(output.gaussians, target.camera, {}).colour;
+    for (float& v : image.data) v = std::clamp(v, 0.f, 1.f);
+    r.psnr += psnr(image, target.colour) / double(scene.targets.size());
+    r.ssim += ssim(image, target.colour) / double(scene.targets.size());
+  }
+  r.precision = r.recall = r.f1 = r.leak = kNan;
+  if (!scene.truth) return r;
+  auto unobserved = [&](const Coord& node) { return states.at(node) == NodeState::kUnobserved; };
+  std::set<Coord> truth, filled;
+  for (const Coord& node : surfaceNodes(*scene.truth, frame, 1))
+    if (unobserved(node)) truth.insert(node);
+  for (const Coord& voxel : output.voxels)
+    if (unobserved(tokenCoord(voxel, 1))) filled.insert(tokenCoord(voxel, 1));
+  double hit = 0;
+  for (const Coord& node : filled) hit += double(truth.count(node));
+  if (!filled.empty()) r.precision = hit / double(filled.size());
+  if (!truth.empty()) r.recall = hit / double(truth.size());
+  if (!truth.empty() || !filled.empty()) r.f1 = 2 * hit / double(truth.size() + filled.size());
+  r.leak = leakRate(RayTarget::fromMesh(*scene.truth), RayTarget::fromVoxels(frame, output.voxels),
+                    scene.free_points, kLeakRays, 2 * frame.voxel_m, 1);
+  return r;
+}
+
+}  // namespace
+
+SceneList sceneList(const std::string& spec, int views, uint64_t seed) {
+  if (spec.rfind("rooms:", 0) == 0) {
+    unsigned long long first = 0, last = 0;
+    int used = 0;
+    const char* text = spec.c_str() + 6;
+    const int found = std::sscanf(text, "%llu%n-%llu%n", &first, &used, &last, &used);
+    if (found == 1) last = first;
+    if (found < 1 || text[used] != '\0' || last < first || last - first > 100000)
+      throw UsageError(joinText("--scenes: ", spec, ": expected rooms:SEED or rooms:SEED-SEED"));
+    for (uint64_t s : {uint64_t(first), uint64_t(last)}) requireHeldOut(s);
+    return {int64_t(last - first + 1), [=](int64_t i) { return roomScene(first + uint64_t(i), views); }};
+  }
+  return {1, [=](int64_t) { return folderScene(spec, views, seed); }};
+}
+
+std::string resultJson(const MethodResult& r) {
+  nlohmann::ordered_json j;
+  auto number = [](double v) { return std::isfinite(v) ? nlohmann::ordered_json(v) : nlohmann::ordered_json(); };
+  j["scene"] = r.scene, j["views"] = r.views, j["method"] = r.method;
+  j["psnr"] = number(r.psnr), j["ssim"] = number(r.ssim);
+  j["precision"] = number(r.precision), j["recall"] = number(r.recall), j["f1"] = number(r.f1);
+  j["leak"] = number(r.leak), j["seconds"] = number(r.seconds);
+  j["peak_rss_mb"] = number(r.peak_rss_mb), j["gaussians"] = r.gaussians;
+  return j.dump();
+}
+
+std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Encoder& encoder,
+                                        const Completer& completer, const SceneSettings& settings,
+                                        Progress& progress) {
+  SceneSettings s = settings;
+  s.volume.up = scene.up;
+  std::vector<MethodResult> results;
+  auto add = [&](const char* method, const MethodOutput& output, double seconds, const VoxelFrame& frame,
+                 const NodeStates& states) {
+    results.push_back(measure(method, scene, output, frame, states));
+    results.back().seconds = seconds, results.back().peak_rss_mb = peakMemoryMb();
+  };
+
+  resetPeakMemory();
+  auto start = std::chrono::steady_clock::now();
+  const Completion c = completeScene(scene.input, encoder, completer, s, progress);
+  const double completed_seconds = secondsSince(start);
+  const double completed_rss = peakMemoryMb();
+  const VoxelFrame& frame = c.observation.frame;
+  const NodeStates states = poolStates(frame, c.observation.space, 1);
+
+  const MethodOutput observed{c.seen_decoded.gaussians, c.seen_decoded.voxels};
+  const SceneVoxels seen = sceneVoxels(c.seen_decoded, c.seen, c.observation.space);
+
+  // Observed-only without the completion, on its own clock.
+  resetPeakMemory();
+  start = std::chrono::steady_clock::now();
+  {
+    std::vector<DepthView> depth;
+    for (const View& v : scene.input) depth.push_back(v.depthView());
+    VolumeSettings volume = s.volume;
+    volume.voxel_m = encoder.config().voxel_m;
+    const Observation o = observe(scene.input, fitVolume(depth, volume, s.carving), encoder.observationSettings(), progress);
+    encoder.decode(encoder.encode(scene.input, o, progress), o.space, s.child_threshold, progress);
+  }
+  const double observed_seconds = secondsSince(start);
+  add("observed", observed, observed_seconds, frame, states);
+
+  start = std::chrono::steady_clock::now();
+  const MethodOutput nearest = nearestFill(observed, seen, states);
+  add("nearest", nearest, observed_seconds + secondsSince(start), frame, states);
+  start = std::chrono::steady_clock::now();
+  const MethodOutput box = manhattanBox(observed, seen, states);
+  add("box", box, observed_seconds + secondsSince(start), frame, states);
+  add("completed", {c.whole_decoded.gaussians, c.whole_decoded.voxels}, completed_seconds, frame, states);
+  results.back().peak_rss_mb = completed_rss;
+
+  if (scene.truth) {
+    resetPeakMemory();
+    start = std::chrono::steady_clock::now();
+    const LatentGrid oracle = completer.completeAt(c.seen, c.observation.space,
+                                                   surfaceNodes(*scene.truth, frame, 1), s.completion, progress);
+    const DecodedGrid d = encoder.decode(oracle, c.observation.space, s.child_threshold, progress);
+    add("oracle-occupancy", {d.gaussians, d.voxels}, observed_seconds + secondsSince(start), frame, states);
+  }
+  return results;
+}
+
+std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results) {
+  std::vector<std::string> methods;
+  for (const MethodResult& r : results)
+    if (std::find(methods.begin(), methods.end(), r.method) == methods.end()) methods.push_back(r.method);
+  std::vector<MethodResult> means;
+  for (const std::string& method : methods) {
+    MethodResult mean;
+    mean.scene = "mean", mean.method = method;
+    for (double MethodResult::*field :
+         {&MethodResult::psnr, &MethodResult::ssim, &MethodResult::precision, &MethodResult::recall,
+          &MethodResult::f1, &MethodResult::leak, &MethodResult::seconds, &MethodResult::peak_rss_mb}) {
+      double sum = 0, n = 0;
+      for (const MethodResult& r : results)
+        if (r.method == method && std::isfinite(r.*field)) sum += r.*field, ++n;
+      mean.*field = n > 0 ? sum / n : kNan;
+    }
+    int64_t gaussians = 0, n = 0;
+    for (const MethodResult& r : results)
+      if (r.method == method) gaussians += r.gaussians, ++n, mean.views = r.views;
+    mean.gaussians = gaussians / std::max<int64_t>(1, n);
+    means.push_back(mean);
+  }
+  return means;
+}
+
+}  // namespace vdbc

@@ -1,0 +1,426 @@
+// vdb_complete: verbs, options and exit codes.
+#include <ATen/Parallel.h>
+#include <tbb/global_control.h>
+
+#include <CLI/CLI.hpp>
+#include <cstdio>
+#include <filesystem>
+#include <nlohmann/json.hpp>
+#include <thread>
+
+#include "encoder/encoder_train.h"
+#include "houdini_style_tools/blas.h"
+#include "houdini_style_tools/complete.h"
+#include "houdini_style_tools/console.h"
+#include "houdini_style_tools/evaluate.h"
+#include "houdini_style_tools/scenes.h"
+#include "splat/rasterize.h"
+
+namespace vdbc {
+namespace {
+
+namespace fs = std::filesystem;
+using nlohmann::ordered_json;
+
+// Options, one struct a verb; names as on the command line.
+struct Common {
+  uint64_t seed = 1;
+  int threads = 0;
+  bool json = false;
+};
+struct Complete {
+  std::string views, frames, output, weights;
+  std::vector<double> up, bounds;
+  double voxel = 0, margin = VolumeSettings().margin_m;
+  double tau = CompleteSettings().tau, coarse_tau = CompleteSettings().coarse_tau;
+  double temperature = 1;
+  int sampling_steps = 0;
+  bool refine_observed = false;
+};
+struct Render {
+  std::string splats, cameras, frames, output;
+  int width = 0;
+};
+struct Check {
+  std::string views, frames, volume;
+};
+struct Evaluate {
+  std::string scenes, weights;
+  int views = 2;
+};
+struct Train {
+  std::string output, work, preset = "small", encoder;
+  int64_t steps = 0, scenes = 0;
+  double rate = 0;
+  bool resume = false;
+};
+
+// "0,3,5-9" -> 0 3 5 6 7 8 9.
+std::vector<int> frameList(const std::string& text) {
+  std::vector<int> frames;
+  std::stringstream parts(text);
+  for (std::string part; std::getline(parts, part, ',');) {
+    int first = 0, last = 0, used = 0;
+    const int found = std::sscanf(part.c_str(), "%d%n-%d%n", &first, &used, &last, &used);
+    if (found == 1) last = first;
+    if (found < 1 || size_t(used) != part.size() || first < 0 || last < first || last - first > 100000)
+      throw UsageError(joinText("--frames: ", text, ": expected numbers and ranges such as 0,3,5-9"));
+    for (int f = first; f <= last; ++f) frames.push_back(f);
+  }
+  return frames;
+}
+
+std::string executableFolder() {
+  std::error_code error;
+  const fs::path self = fs::read_symlink("/proc/self/exe", error);
+  return error ? "." : self.parent_path().string();
+}
+
+// The folder with encoder.safetensors and completer.safetensors.
+std::string weightsFolder(const std::string& given) {
+  if (!given.empty()) return given;
+  for (const char* place : {"/../../weights/small", "/../share/vdb_complete/weights/small"}) {
+    const std::string folder = executableFolder() + place;
+    if (fs::exists(folder + "/encoder.safetensors")) return fs::weakly_canonical(folder).string();
+  }
+  throw Error("--weights: no trained weights beside the program (expected weights/small; use --weights FOLDER)");
+}
+
+SceneSettings sceneSettings(const Complete& o, const Common& common, const Eigen::Vector3d& up) {
+  SceneSettings s;
+  s.volume.up = up;
+  s.volume.margin_m = float(o.margin);
+  if (!o.bounds.empty()) {
+    s.volume.bounds = Eigen::AlignedBox3d(Eigen::Vector3d(o.bounds[0], o.bounds[1], o.bounds[2]),
+                                          Eigen::Vector3d(o.bounds[3], o.bounds[4], o.bounds[5]));
+    if (s.volume.bounds->sizes().minCoeff() <= 0)
+      throw UsageError("--bounds: expected a box: x0 y0 z0 x1 y1 z1 with each second corner larger");
+  }
+  s.completion.tau = float(o.tau), s.completion.coarse_tau = float(o.coarse_tau);
+  s.completion.sampling_steps = o.sampling_steps, s.completion.temperature = o.temperature;
+  s.completion.refine_observed = o.refine_observed;
+  s.completion.seed = common.seed;
+  return s;
+}
+
+Eigen::Vector3d upOf(const Complete& o) {
+  if (o.up.empty()) return conventionalUp(o.views);
+  const Eigen::Vector3d up(o.up[0], o.up[1], o.up[2]);
+  if (!(up.norm() > 1e-6)) throw UsageError("--up: expected a vector that is not zero");
+  return up.normalized();
+}
+
+void cookComplete(const Complete& o, const Common& common, Progress& progress) {
+  const std::vector<int> frames = frameList(o.frames);
+  const std::string stem = outputStem(o.output);
+  const std::string weights = weightsFolder(o.weights);
+  const auto start = std::chrono::steady_clock::now();
+  progress.start("read");
+  const std::vector<View> views = readViews(o.views, {frames, 0});
+  const Eigen::Vector3d up = upOf(o);
+  SceneSettings settings = sceneSettings(o, common, up);
+  const Encoder encoder(weights + "/encoder.safetensors");
+  const Completer completer(weights + "/completer.safetensors");
+  progress.end();
+  settings.volume.voxel_m = o.voxel > 0 ? float(o.voxel) : encoder.config().voxel_m;
+  const Completion c = completeScene(views, encoder, completer, settings, progress);
+  writeCompletion(views, c, stem, up, progress);
+  const double seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+  if (common.json) {
+    std::printf("%s\n", ordered_json{{"views", views.size()}, {"observed_tokens", c.seen.size()},
+                                     {"generated_tokens", c.whole.size() - c.seen.size()},
+                                     {"voxels", c.whole_decoded.voxels.size()},
+                                     {"gaussians", c.whole_decoded.gaussians.size()},
+                                     {"seconds", seconds}, {"output", stem}}.dump().c_str());
+  } else {
+    std::printf("%zu views: %lld tokens observed, %lld generated; %zu voxels, %lld Gaussians; %.1f s\n"
+                "%s.vdb  %s.points.vdb  %s.ply  %s.png\n",
+                views.size(), static_cast<long long>(c.seen.size()),
+                static_cast<long long>(c.whole.size() - c.seen.size()), c.whole_decoded.voxels.size(),
+                static_cast<long long>(c.whole_decoded.gaussians.size()), seconds, stem.c_str(),
+                stem.c_str(), stem.c_str(), stem.c_str());
+  }
+}
+
+void cookInfo(const Common& common, int threads) {
+  const BlasInfo blas = blasInfo(true);
+  ordered_json j{{"version", VDBC_VERSION}, {"blas", blas.library}, {"core", blas.core},
+                 {"blas_threads", blas.threads}, {"threads", threads}, {"gflops", blas.gflops}};
+  std::string weights;
+  try {
+    weights = weightsFolder("");
+  } catch (const Error&) {
+  }
+  if (!weights.empty()) {
+    const Encoder encoder(weights + "/encoder.safetensors");
+    const Completer completer(weights + "/completer.safetensors");
+    j["weights"] = weights;
+    j["encoder"] = {{"preset", encoder.config().preset}, {"hash", encoder.hash()}, {"trained_on", encoder.trainedOn()}};
+    j["completer"] = {{"preset", completer.config().preset}, {"hash", completer.hash()}, {"trained_on", completer.trainedOn()}};
+  }
+  if (common.json) {
+    std::printf("%s\n", j.dump().c_str());
+    return;
+  }
+  for (const auto& [key, value] : j.items())
+    std::printf("%-13s %s\n", key.c_str(), value.is_string() ? value.get<std::string>().c_str() : value.dump().c_str());
+}
+
+Gaussians readSplats(const std::string& path) {
+  if (fs::path(path).extension() == ".ply") return readPly(path);
+  if (fs::path(path).extension() == ".vdb") return readPointsVdb(path);
+  throw UsageError(joinText("render: ", path, ": expected .ply or .points.vdb"));
+}
+
+void cookRender(const Render& o, const Common& common, Progress& progress) {
+  const Gaussians g = readSplats(o.splats);
+  const std::vector<View> views = readViews(o.cameras, {frameList(o.frames), 0});
+  std::error_code error;
+  fs::create_directories(o.output, error);
+  require(!error && fs::is_directory(o.output), "render: ", o.output, ": cannot create the folder");
+  progress.start("render");
+  for (size_t i = 0; i < views.size(); ++i) {
+    report(progress, int(100 * i / views.size()));
+    Camera c = views[i].camera;
+    if (o.width > 0) c = resized(c, o.width, std::max(1, int(std::lround(double(c.height) * o.width / c.width))));
+    char name[32];
+    std::snprintf(name, sizeof name, "/%04zu.png", i);
+    writePng(rasterize(g, c, {}).colour, o.output + name);
+    if (common.json) std::printf("%s\n", ordered_json{{"view", views[i].name}, {"image", o.output + name}}.dump().c_str());
+  }
+  progress.end();
+}
+
+void cookCheck(const Check& o, const Common& common) {
+  const std::vector<View> views = readViews(o.views, {frameList(o.frames), 0});
+  const SceneVoxels voxels = readSceneVdb(o.volume);
+  const RayTarget target = RayTarget::fromVoxels(voxels.frame, voxels.ijk);
+  const DepthAgreement a = depthAgreement(target, views, 2 * voxels.frame.voxel_m);
+  std::vector<Eigen::Vector3f> origins;
+  for (const View& v : views) origins.push_back(v.camera.world_from_camera.translation().cast<float>());
+  const double open = openShare(target, origins, 16384, common.seed);
+  const ordered_json j{{"voxels", voxels.ijk.size()}, {"rays", a.rays}, {"median_depth_error_m", a.median_error_m},
+                       {"within_two_voxels", a.within_share}, {"missed", a.miss_share}, {"open_directions", open}};
+  if (common.json) {
+    std::printf("%s\n", j.dump().c_str());
+  } else {
+    for (const auto& [key, value] : j.items()) std::printf("%-21s %s\n", key.c_str(), value.dump().c_str());
+  }
+}
+
+void cookEvaluate(const Evaluate& o, const Complete& options, const Common& common, Progress& progress) {
+  const SceneList scenes = sceneList(o.scenes, o.views, common.seed);
+  const std::string weights = weightsFolder(o.weights);
+  const Encoder encoder(weights + "/encoder.safetensors");
+  const Completer completer(weights + "/completer.safetensors");
+  SceneSettings settings = sceneSettings(options, common, Eigen::Vector3d::UnitZ());
+  settings.volume.voxel_m = encoder.config().voxel_m;
+  std::vector<MethodResult> all;
+  auto show = [&](const MethodResult& r) {
+    if (common.json) {
+      std::printf("%s\n", resultJson(r).c_str());
+    } else {
+      std::printf("%-14s %-17s psnr %6.2f  ssim %.3f  precision %.3f  recall %.3f  f1 %.3f  leak %.3f  %6.2f s  %5.0f MB  %lld\n",
+                  r.scene.c_str(), r.method.c_str(), r.psnr, r.ssim, r.precision, r.recall, r.f1, r.leak,
+                  r.seconds, r.peak_rss_mb, static_cast<long long>(r.gaussians));
+    }
+    std::fflush(stdout);
+  };
+  for (int64_t i = 0; i < scenes.count; ++i)
+    for (const MethodResult& r : evaluateScene(scenes.scene(i), encoder, completer, settings, progress)) {
+      show(r);
+      all.push_back(r);
+    }
+  for (const MethodResult& r : meanResults(all)) show(r);
+}
+
+TrainSettings trainSettings(const Train& t, const Common& common) {
+  TrainSettings s;
+  s.weights_path = t.output;
+  s.work_folder = t.work.empty() ? t.output + ".work" : t.work;
+  s.steps = t.steps, s.learning_rate = t.rate, s.seed = common.seed, s.resume = t.resume;
+  return s;
+}
+
+TrainListener trainListener(bool json) {
+  return [json](const TrainLogRow& row) {
+    nlohmann::json j = row.values;
+    j["step"] = row.step;
+    if (json) {
+      std::printf("%s\n", j.dump().c_str());
+    } else {
+      std::printf("step %lld", static_cast<long long>(row.step));
+      for (const auto& [name, value] : row.values) std::printf("  %s %.4g", name.c_str(), value);
+      std::printf("\n");
+    }
+    std::fflush(stdout);
+  };
+}
+
+std::string seedRange(uint64_t first, int64_t count) {
+  return joinText("rooms:", first, "-", first + uint64_t(count) - 1);
+}
+
+void cookTrainEncoder(const Train& t, const Common& common, Progress& progress) {
+  constexpr int kValidationRooms = 12;
+  const EncoderConfig config = t.preset == "paper" ? EncoderConfig::paper() : EncoderConfig::small();
+  TrainSettings s = trainSettings(t, common);
+  s.metadata["trained_on"] = seedRange(kEncoderTrainingSeed, t.scenes);
+  s.metadata["validated_on"] = seedRange(kValidationSeed, kValidationRooms);
+  trainEncoder(config, [](uint64_t i) { return roomViews(kEncoderTrainingSeed + i, kRoomViews); }, t.scenes,
+               [](uint64_t i) { return roomViews(kValidationSeed + i, kRoomViews); }, kValidationRooms, s,
+               trainListener(common.json), progress);
+}
+
+void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
+  constexpr int kValidationRooms = 16;
+  const Encoder encoder(t.encoder);
+  CompleterConfig config = t.preset == "paper" ? CompleterConfig::paper() : CompleterConfig::small();
+  config.latent_dim = encoder.config().latent_dim;
+  TrainSettings s = trainSettings(t, common);
+  s.metadata["trained_on"] = seedRange(kCompleterTrainingSeed, t.scenes);
+  s.metadata["validated_on"] = seedRange(kValidationSeed, kValidationRooms);
+  s.metadata["encoder_hash"] = encoder.hash();
+  // Samples depend on the encoder: its hash names their folder.
+  const std::string cache = s.work_folder + "/samples_" + encoder.hash();
+  auto source = [&](uint64_t first) {
+    return [&, first](uint64_t i) { return completionSample(encoder, first + i, cache); };
+  };
+  progress.start("encode rooms");
+  for (int64_t i = 0; i < t.scenes; ++i) {
+    source(kCompleterTrainingSeed)(uint64_t(i));
+    report(progress, int(100 * i / t.scenes));
+  }
+  progress.end();
+  trainCompleter(config, source(kCompleterTrainingSeed), t.scenes, source(kValidationSeed), kValidationRooms, s,
+                 trainListener(common.json), progress);
+}
+
+void addCommon(CLI::App* app, Common* c) {
+  app->add_option("--seed", c->seed, "fixes every random choice")->capture_default_str();
+  app->add_option("--threads", c->threads, "worker threads, 0 = all cores")
+      ->envname("VDB_COMPLETE_THREADS")->check(CLI::Range(0, 1024))->capture_default_str();
+  app->add_flag("--json", c->json, "results (stdout) and progress (stderr) as JSON, one object a line");
+}
+
+void addCompletion(CLI::App* app, Complete* o) {
+  app->add_option("--margin", o->margin, "room around what was seen [m]")->check(CLI::Range(0., 100.))->capture_default_str();
+  app->add_option("--tau", o->tau, "a token is kept above this probability")->check(CLI::Range(0., 1.))->capture_default_str();
+  app->add_option("--coarse-tau", o->coarse_tau, "the same for the coarse gate")->check(CLI::Range(0., 1.))->capture_default_str();
+  app->add_option("--sampling-steps", o->sampling_steps, "diffusion steps, 0 = the linear mean")->check(CLI::Range(0, 1000))->capture_default_str();
+  app->add_option("--temperature", o->temperature, "of the diffusion head")->check(CLI::Range(0., 10.))->capture_default_str();
+  app->add_flag("--refine-observed", o->refine_observed, "let the completer rewrite observed latents");
+}
+
+void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rate) {
+  verb->add_option("-o,--output", t->output, "weights to write (.safetensors)")->required();
+  verb->add_option("--work", t->work, "folder for checkpoint, log and pictures [OUTPUT.work]");
+  verb->add_option("--preset", t->preset, "small or paper")->check(CLI::IsMember({"small", "paper"}))->capture_default_str();
+  auto* s = verb->add_option("--steps", t->steps, joinText("training steps [", steps, "]"))->check(CLI::Range(int64_t(1), int64_t(1) << 40));
+  auto* n = verb->add_option("--rooms", t->scenes, joinText("procedural rooms to train on [", rooms, "]"))
+                ->check(CLI::Range(int64_t(1), int64_t(kReservedSeeds)));
+  auto* r = verb->add_option("--rate", t->rate, joinText("peak learning rate [", rate, "]"))->check(CLI::Range(0., 1.));
+  verb->add_flag("--resume", t->resume, "continue from the checkpoint in the work folder");
+  verb->callback([=] {
+    if (!s->count()) t->steps = steps;
+    if (!n->count()) t->scenes = rooms;
+    if (!r->count()) t->rate = rate;
+  });
+}
+
+int run(int argc, char** argv) {
+  CLI::App app{"Completes a place seen in a few RGB-D views as OpenVDB grids and 3-D Gaussians.\n"
+               "Without a verb: vdb_complete VIEWS -o X.vdb writes X.vdb, X.points.vdb, X.ply and X.png.",
+               "vdb_complete"};
+  app.set_version_flag("--version", VDBC_VERSION);
+  Common common;
+  Complete complete, eval_options;
+  Render render;
+  Check check;
+  Evaluate evaluate;
+  Train train;
+  app.require_subcommand(0, 1);
+
+  addCommon(&app, &common);
+  app.add_option("VIEWS", complete.views, "folder with transforms.json, a transforms.json, or EXR file(s) with Z or P");
+  app.add_option("--frames", complete.frames, "which of the views, 0,3,5-9 say [all]");
+  app.add_option("-o,--output", complete.output, "X.vdb to write, with X.points.vdb, X.ply and X.png beside it");
+  app.add_option("--weights", complete.weights, "folder with encoder.safetensors and completer.safetensors");
+  app.add_option("--up", complete.up, "x y z that points up in the world [the format's]")->expected(3);
+  app.add_option("--bounds", complete.bounds, "x0 y0 z0 x1 y1 z1 to complete [seen and margin]")->expected(6);
+  app.add_option("--voxel", complete.voxel, "voxel edge [the weights']")->check(CLI::Range(.001, 100.));
+  addCompletion(&app, &complete);
+
+  CLI::App* info = app.add_subcommand("info", "BLAS, threads, speed and weights");
+  CLI::App* verb_render = app.add_subcommand("render", "Gaussians from the cameras of some views, as PNG");
+  verb_render->add_option("SPLATS", render.splats, ".ply or .points.vdb")->required();
+  verb_render->add_option("--cameras", render.cameras, "views whose cameras to take")->required();
+  verb_render->add_option("--frames", render.frames, "which of the views [all]");
+  verb_render->add_option("--width", render.width, "pixels [the view's]")->check(CLI::Range(1, 16384));
+  verb_render->add_option("-o,--output", render.output, "folder for 0000.png, ...")->required();
+  CLI::App* verb_check = app.add_subcommand("check", "depth agreement and open directions, by Embree");
+  verb_check->add_option("VIEWS", check.views, "views to compare with")->required();
+  verb_check->add_option("VOLUME", check.volume, "X.vdb")->required();
+  verb_check->add_option("--frames", check.frames, "which of the views [all]");
+  CLI::App* verb_eval = app.add_subcommand("eval", "compares all methods on scenes that were never trained on");
+  verb_eval->add_option("--scenes", evaluate.scenes, "rooms:SEED-SEED, or a folder with transforms.json")->required();
+  verb_eval->add_option("--views", evaluate.views, "input views a scene")->check(CLI::Range(1, 1000))->capture_default_str();
+  verb_eval->add_option("--weights", evaluate.weights, "folder with encoder.safetensors and completer.safetensors");
+  addCompletion(verb_eval, &eval_options);
+  CLI::App* verb_train = app.add_subcommand("train", "trains a network on procedural rooms");
+  verb_train->require_subcommand(1);
+  CLI::App* train_encoder = verb_train->add_subcommand("encoder", "the encoder-decoder");
+  addTrain(train_encoder, &train, 4000, 1000, 1e-3);
+  CLI::App* train_mar = verb_train->add_subcommand("mar", "the masked auto-regressive completer");
+  addTrain(train_mar, &train, 8000, 400, 8e-4);
+  train_mar->add_option("--encoder", train.encoder, "encoder weights")->required();
+  for (CLI::App* verb : {info, verb_render, verb_check, verb_eval, train_encoder, train_mar}) addCommon(verb, &common);
+
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& e) {
+    return app.exit(e) == 0 ? 0 : 2;
+  }
+  const int threads = common.threads ? common.threads : int(std::max(1u, std::thread::hardware_concurrency()));
+  const tbb::global_control limit(tbb::global_control::max_allowed_parallelism, size_t(threads));
+  at::set_num_threads(threads);
+  Console console(common.json);
+  if (info->parsed()) {
+    cookInfo(common, threads);
+  } else if (verb_render->parsed()) {
+    cookRender(render, common, console);
+  } else if (verb_check->parsed()) {
+    cookCheck(check, common);
+  } else if (verb_eval->parsed()) {
+    cookEvaluate(evaluate, eval_options, common, console);
+  } else if (train_encoder->parsed()) {
+    cookTrainEncoder(train, common, console);
+  } else if (train_mar->parsed()) {
+    cookTrainMar(train, common, console);
+  } else if (complete.views.empty() || complete.output.empty()) {
+    throw UsageError("expected VIEWS and -o X.vdb, or a verb (vdb_complete --help)");
+  } else {
+    cookComplete(complete, common, console);
+  }
+  return 0;
+}
+
+}  // namespace
+}  // namespace vdbc
+
+int main(int argc, char** argv) {
+  vdbc::chooseBlasCore();
+  try {
+    return vdbc::run(argc, argv);
+  } catch (const vdbc::Cancelled&) {
+    std::fprintf(stderr, "\nvdb_complete: interrupted\n");
+    return 130;
+  } catch (const vdbc::UsageError& e) {
+    std::fprintf(stderr, "vdb_complete: %s\n", e.what());
+    return 2;
+  } catch (const std::exception& e) {
+    const std::string text = e.what();  // torch appends its stack
+    std::fprintf(stderr, "vdb_complete: %s\n", text.substr(0, text.find('\n')).c_str());
+    return 1;
+  }
+}

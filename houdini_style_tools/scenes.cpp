@@ -1,0 +1,64 @@
+#include "houdini_style_tools/scenes.h"
+
+#include <algorithm>
+#include <filesystem>
+#include <random>
+
+#include "examples/rooms/rooms.h"
+#include "vdb/scene_volume.h"
+
+namespace vdbc {
+
+namespace fs = std::filesystem;
+
+void requireHeldOut(uint64_t seed) {
+  for (uint64_t first : {kEncoderTrainingSeed, kCompleterTrainingSeed, kValidationSeed})
+    require(seed < first || seed >= first + kReservedSeeds, "eval: rooms:", seed,
+            ": this seed is reserved for training (expected one outside ", first, "-",
+            first + kReservedSeeds - 1, ")");
+}
+
+std::vector<View> roomViews(uint64_t seed, int count) {
+  const Room room = makeRoom(seed);
+  const RoomRenderer renderer(room);
+  std::mt19937_64 random(seed);
+  std::vector<View> views;
+  for (const Camera& camera : randomCameras(room, count, kRoomSide, kRoomSide, random))
+    views.push_back(renderer.render(camera, kRoomSamples, seed + views.size()));
+  return views;
+}
+
+VoxelFrame completionFrame(const std::vector<View>& views, const EncoderConfig& config,
+                           const Eigen::Vector3d& up) {
+  VolumeSettings volume;
+  volume.voxel_m = config.voxel_m;
+  volume.up = up;
+  std::vector<DepthView> depth;
+  for (const View& v : views) depth.push_back(v.depthView());
+  return fitVolume(depth, volume, CarveSettings());
+}
+
+CompletionSample completionSample(const Encoder& encoder, uint64_t seed, const std::string& cache_folder) {
+  const std::string path = cache_folder + "/" + std::to_string(seed) + ".sample";
+  if (fs::exists(path)) return readSample(path);
+  const std::vector<View> views = roomViews(seed, kRoomViews);
+  // The cameras are random already: the first n are a random choice. Two views are the hardest case
+  // that is promised, so half of the samples have two.
+  static constexpr size_t kCounts[] = {1, 2, 2, 2, 2, 3, 4, 6};
+  const size_t n = kCounts[seed % 8];
+  const std::vector<View> few(views.begin(), views.begin() + std::ptrdiff_t(n));
+  const VoxelFrame frame = completionFrame(few, encoder.config(), Eigen::Vector3d::UnitZ());
+  Progress silent;
+  const Observation sparse = observe(few, frame, encoder.observationSettings(), silent);
+  const Observation dense = observe(views, frame, encoder.observationSettings(), silent);
+  CompletionSample s;
+  s.condition = encoder.encode(few, sparse, silent);
+  s.target = encoder.encode(views, dense, silent);
+  s.seen_nodes = poolStates(frame, sparse.space, 1), s.seen_coarse = poolStates(frame, sparse.space, 2);
+  s.target_nodes = poolStates(frame, dense.space, 1), s.target_coarse = poolStates(frame, dense.space, 2);
+  fs::create_directories(cache_folder);
+  writeSample(s, path);
+  return s;
+}
+
+}  // namespace vdbc

@@ -1,0 +1,788 @@
+#include "splat/gaussian_io.h"
+
+#include <openvdb/io/Archive.h>
+#include <openvdb/io/Stream.h>
+#include <openvdb/openvdb.h>
+#include <openvdb/points/PointAttribute.h>
+#include <openvdb/points/PointDataGrid.h>
+#include <openvdb/points/PointGroup.h>
+#include <tbb/parallel_for.h>
+#include <tbb/parallel_sort.h>
+
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <array>
+#include <charconv>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <numeric>
+#include <sstream>
+
+#include "splat/image.h"
+#include "vdb/error.h"
+#include "vdb/file_io.h"
+
+namespace vdbc {
+namespace {
+
+constexpr uint64_t kMaxFileBytes = uint64_t(1) << 38;
+constexpr float kMaxLogit = 15.f;  // 3DGS tools take the sigmoid in float
+constexpr int kShSlots = 16;       // GS_SPH_R has room for degree 3 whatever the degree
+
+bool isFinite(const Gaussians& g, int64_t i) {
+  const size_t n = size_t(g.shCoefficients()) * 3, row = size_t(i);
+  if (!g.mean[row].allFinite() || !g.log_scale[row].allFinite() || !g.rotation[row].allFinite() ||
+      !std::isfinite(g.opacity_logit[row])) {
+    return false;
+  }
+  const float* sh = g.sh.data() + row * n;
+  return std::all_of(sh, sh + n, [](float v) { return std::isfinite(v); });
+}
+
+/// Rows worth writing: finite, with a rotation.
+std::vector<int64_t> writableRows(const Gaussians& g) {
+  std::vector<int64_t> rows;
+  rows.reserve(size_t(g.size()));
+  for (int64_t i = 0; i < g.size(); ++i) {
+    if (isFinite(g, i) && g.rotation[size_t(i)].stableNorm() > 1e-30f) rows.push_back(i);
+  }
+  return rows;
+}
+
+Eigen::Vector4f unitRotation(const Eigen::Vector4f& q) {
+  // What is normalised already stays bit for bit.
+  return std::abs(q.squaredNorm() - 1.f) < 1e-6f ? q : q.stableNormalized();
+}
+
+/// Keeps the rows with keep[i] != 0.
+void keepRows(const std::vector<uint8_t>& keep, Gaussians* g, Provenance* provenance) {
+  if (std::all_of(keep.begin(), keep.end(), [](uint8_t k) { return k != 0; })) return;
+  const size_t n = size_t(g->shCoefficients()) * 3;
+  size_t to = 0;
+  for (size_t i = 0; i < keep.size(); ++i) {
+    if (!keep[i]) continue;
+    g->mean[to] = g->mean[i];
+    g->log_scale[to] = g->log_scale[i];
+    g->rotation[to] = g->rotation[i];
+    g->opacity_logit[to] = g->opacity_logit[i];
+    std::copy_n(g->sh.data() + i * n, n, g->sh.data() + to * n);
+    if (provenance) {
+      provenance->generated[to] = provenance->generated[i];
+      provenance->probability[to] = provenance->probability[i];
+    }
+    ++to;
+  }
+  g->resize(int64_t(to), g->sh_degree);
+  if (provenance) provenance->generated.resize(to), provenance->probability.resize(to);
+}
+
+void dropNonFinite(Gaussians* g, Provenance* provenance) {
+  std::vector<uint8_t> keep(size_t(g->size()));
+  for (size_t i = 0; i < keep.size(); ++i) keep[i] = isFinite(*g, int64_t(i));
+  keepRows(keep, g, provenance);
+}
+
+// ---- PLY
+
+constexpr size_t kMaxHeaderBytes = 128 << 10;
+
+struct PlyProperty {
+  std::string name, type;
+  size_t offset = 0;  // bytes into the row
+};
+
+struct PlyElement {
+  std::string name;
+  uint64_t count = 0;
+  size_t row_bytes = 0;
+  std::vector<PlyProperty> properties;
+};
+
+struct PlyHeader {
+  std::vector<PlyElement> elements;
+  size_t bytes = 0;
+};
+
+size_t plyTypeBytes(const std::string& type) {
+  for (const auto& [names, size] :
+       {std::pair<std::array<const char*, 4>, size_t>{{"char", "uchar", "int8", "uint8"}, 1},
+        {{"short", "ushort", "int16", "uint16"}, 2},
+        {{"int", "uint", "int32", "uint32"}, 4},
+        {{"float", "float32", "float", "float32"}, 4},
+        {{"double", "float64", "double", "float64"}, 8}}) {
+    for (const char* name : names) {
+      if (type == name) return size;
+    }
+  }
+  return 0;
+}
+
+PlyHeader parsePlyHeader(const std::vector<uint8_t>& bytes, const std::string& path) {
+  const std::string prefix = "readPly: " + path + ": ";
+  const auto* begin = reinterpret_cast<const char*>(bytes.data());
+  const std::string_view text(begin, std::min(bytes.size(), kMaxHeaderBytes));
+  PlyHeader header;
+  bool format_seen = false;
+  for (size_t line_number = 0;; ++line_number) {
+    const size_t end = text.find('\n', header.bytes);
+    require(line_number > 0 || text.substr(0, 3) == "ply", prefix, "not a PLY file");
+    require(end != std::string_view::npos, prefix, "the header has no end_header line");
+    std::string line(text.substr(header.bytes, end - header.bytes));
+    header.bytes = end + 1;
+    if (!line.empty() && line.back() == '\r') line.pop_back();
+    std::istringstream words(line);
+    std::string keyword, first, second, extra;
+    words >> keyword;
+    if (line_number == 0) {
+      require(line == "ply", prefix, "not a PLY file");
+    } else if (keyword == "comment" || keyword == "obj_info" || keyword.empty()) {
+      continue;
+    } else if (keyword == "format") {
+      words >> first >> second;
+      require(first == "binary_little_endian" && second == "1.0", prefix,
+              "expected format binary_little_endian 1.0, found ", first, " ", second);
+      format_seen = true;
+    } else if (keyword == "element") {
+      words >> first >> second;
+      PlyElement element;
+      element.name = first;
+      const auto [stop, failure] =
+          std::from_chars(second.data(), second.data() + second.size(), element.count);
+      require(!first.empty() && failure == std::errc() && stop == second.data() + second.size(),
+              prefix, "expected `element NAME COUNT`, found `", line, "`");
+      header.elements.push_back(element);
+    } else if (keyword == "property") {
+      words >> first >> second >> extra;
+      require(first != "list", prefix, "list properties are not supported (found `", line, "`)");
+      const size_t size = plyTypeBytes(first);
+      require(!header.elements.empty() && size > 0 && !second.empty() && extra.empty(), prefix,
+              "expected `property TYPE NAME` of an element, found `", line, "`");
+      PlyElement& element = header.elements.back();
+      for (const PlyProperty& other : element.properties) {
+        require(other.name != second, prefix, "property ", second, " is there twice");
+      }
+      element.properties.push_back({second, first, element.row_bytes});
+      element.row_bytes += size;
+    } else if (keyword == "end_header") {
+      require(format_seen, prefix, "the header has no format line");
+      return header;
+    } else {
+      throw Error(prefix + "unknown header line `" + line + "`");
+    }
+  }
+}
+
+/// Offset and type of the splat's values in a row of the vertex element.
+struct PlyLayout {
+  struct Field {
+    size_t offset = 0;
+    bool is_double = false;
+    float read(const uint8_t* row) const {
+      if (is_double) {
+        double value;
+        std::memcpy(&value, row + offset, sizeof(value));
+        return float(value);
+      }
+      float value;
+      std::memcpy(&value, row + offset, sizeof(value));
+      return value;
+    }
+  };
+  std::array<Field, 3> mean, f_dc, scale;
+  std::array<Field, 4> rotation;
+  Field opacity;
+  std::vector<Field> f_rest;  // channel-major
+  int sh_degree = 0;
+};
+
+PlyLayout plyLayout(const PlyElement& vertex, const std::string& path) {
+  const auto has = [&](const std::string& name) {
+    return std::any_of(vertex.properties.begin(), vertex.properties.end(),
+                       [&](const PlyProperty& p) { return p.name == name; });
+  };
+  const auto field = [&](const std::string& name) {
+    for (const PlyProperty& p : vertex.properties) {
+      if (p.name != name) continue;
+      const bool is_float = p.type == "float" || p.type == "float32";
+      const bool is_double = p.type == "double" || p.type == "float64";
+      require(is_float || is_double, "readPly: ", path, ": property ", name,
+              ": expected float, found ", p.type);
+      return PlyLayout::Field{p.offset, is_double};
+    }
+    throw Error(joinText("readPly: ", path, ": not a Gaussian splat: no property ", name,
+                         " (expected x y z f_dc_0-2 opacity scale_0-2 rot_0-3)"));
+  };
+  PlyLayout layout;
+  layout.mean = {field("x"), field("y"), field("z")};
+  layout.f_dc = {field("f_dc_0"), field("f_dc_1"), field("f_dc_2")};
+  layout.opacity = field("opacity");
+  layout.scale = {field("scale_0"), field("scale_1"), field("scale_2")};
+  layout.rotation = {field("rot_0"), field("rot_1"), field("rot_2"), field("rot_3")};
+  size_t rest = 0;
+  while (has("f_rest_" + std::to_string(rest))) {
+    layout.f_rest.push_back(field("f_rest_" + std::to_string(rest++)));
+  }
+  const size_t named =
+      size_t(std::count_if(vertex.properties.begin(), vertex.properties.end(),
+                           [](const PlyProperty& p) { return p.name.rfind("f_rest_", 0) == 0; }));
+  const std::array<size_t, 4> counts = {0, 9, 24, 45};
+  const auto degree = std::find(counts.begin(), counts.end(), rest);
+  require(degree != counts.end() && named == rest, "readPly: ", path,
+          ": expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ..., found ", named);
+  layout.sh_degree = int(degree - counts.begin());
+  return layout;
+}
+
+// ---- OpenVDB points
+
+using PointTree = openvdb::points::PointDataTree;
+using PointLeaf = PointTree::LeafNodeType;
+using PointGrid = openvdb::points::PointDataGrid;
+using openvdb::Vec3f;
+using openvdb::math::Quats;
+
+// Pairs of type and codec that every OpenVDB reader has registered (formats.md 2.2).
+using PositionCodec = openvdb::points::FixedPointCodec<false, openvdb::points::PositionRange>;
+using UnitCodec = openvdb::points::FixedPointCodec<false, openvdb::points::UnitRange>;
+using HalfCodec = openvdb::points::TruncateCodec;
+using ExactCodec = openvdb::points::NullCodec;
+
+constexpr std::array<const char*, 3> kShNames = {"GS_SPH_R", "GS_SPH_G", "GS_SPH_B"};
+constexpr float kMaxHalf = 65504.f;
+// The 16-bit fixed-point codecs divide [0, 1] (GS_Alpha) and [-.5, .5] (P, voxels) into such steps
+// and round down: half a step more makes that the nearest.
+constexpr float kFixedStep = 1.f / 65535;
+// Index coordinates stay within +-2^19 so that a leaf's place and a voxel's place in it fit 64
+// bits.
+constexpr int kIndexBits = 20;
+
+/// Bits of v spread to every third position.
+uint64_t spreadBits(uint64_t v) {
+  v &= 0x1fffff;
+  v = (v | v << 32) & 0x1f00000000ffffull;
+  v = (v | v << 16) & 0x1f0000ff0000ffull;
+  v = (v | v << 8) & 0x100f00f00f00f00full;
+  v = (v | v << 4) & 0x10c30c30c30c30c3ull;
+  v = (v | v << 2) & 0x1249249249249249ull;
+  return v;
+}
+
+/// The voxel edge (metres) at which occupied voxels hold about 8 points. Sorting the points once in
+/// Morton order gives the number of occupied cells at every level of an octree over their box:
+/// neighbours in that order share a cell down to the level where their codes part. The edge is
+/// interpolated between the two levels around the wanted count.
+double pointsVoxelSize(const Gaussians& g, const std::vector<int64_t>& rows) {
+  constexpr int kLevels = 21;
+  if (rows.empty()) return 0.1;
+  Eigen::AlignedBox<double, 3> box;
+  for (int64_t row : rows) box.extend(g.mean[size_t(row)].cast<double>());
+  const double farthest =
+      std::max(box.min().cwiseAbs().maxCoeff(), box.max().cwiseAbs().maxCoeff());
+  const double extent = box.sizes().maxCoeff();
+  const double smallest = std::max(farthest / double(1 << (kIndexBits - 1)), 1e-6);
+  if (!(extent > 0)) return std::max(smallest, 0.01);
+  std::vector<uint64_t> codes(rows.size());
+  const double cells = double((1 << kLevels) - 1) / extent;
+  for (size_t i = 0; i < rows.size(); ++i) {
+    const Eigen::Vector3d p = (g.mean[size_t(rows[i])].cast<double>() - box.min()) * cells;
+    codes[i] = spreadBits(uint64_t(p.x())) << 2 | spreadBits(uint64_t(p.y())) << 1 |
+               spreadBits(uint64_t(p.z()));
+  }
+  tbb::parallel_sort(codes.begin(), codes.end());
+  std::array<double, kLevels + 1> occupied{};  // by level; level l has cells of extent / 2^l
+  for (size_t i = 1; i < codes.size(); ++i) {
+    const uint64_t differing = codes[i - 1] ^ codes[i];
+    if (!differing) continue;
+    const int highest = 63 - __builtin_clzll(differing);
+    occupied[size_t(kLevels - highest / 3)] += 1;
+  }
+  occupied[0] = 1;
+  std::partial_sum(occupied.begin(), occupied.end(), occupied.begin());
+  const double wanted = std::max(1.0, double(rows.size()) / 8);
+  int level = 0;
+  while (level < kLevels && occupied[size_t(level) + 1] <= wanted) ++level;
+  double fraction = 0;
+  if (level < kLevels) {
+    const double low = occupied[size_t(level)], high = occupied[size_t(level) + 1];
+    fraction = std::log(wanted / low) / std::log(high / low);
+  }
+  return std::max(smallest, extent * std::exp2(-(level + fraction)));
+}
+
+/// A point's place: leaf and voxel in it in `key`, and its row.
+struct PlacedRow {
+  uint64_t key;
+  int64_t row;
+  bool operator<(const PlacedRow& other) const {
+    return key != other.key ? key < other.key : row < other.row;
+  }
+};
+
+/// Points [begin, end) of the sorted rows lie in `leaf`.
+struct LeafRows {
+  PointLeaf* leaf;
+  size_t begin, end;
+};
+
+template <typename T, typename Codec>
+auto writeHandle(PointLeaf& leaf, const char* name) {
+  return openvdb::points::AttributeWriteHandle<T, Codec>(leaf.attributeArray(name));
+}
+
+float sigmoid(float logit) { return 1.f / (1.f + std::exp(-logit)); }
+
+float logitOf(float probability) {
+  // GS_Alpha has steps of 1/65535: 0 and 1 stand for what rounds to them.
+  const float p = std::clamp(probability, 0.25f * kFixedStep, 1 - 0.25f * kFixedStep);
+  return std::log(p / (1 - p));
+}
+
+void fillLeaf(const Gaussians& g, const Provenance& provenance,
+              const std::vector<PlacedRow>& placed, const LeafRows& range,
+              const openvdb::math::Transform& transform) {
+  PointLeaf& leaf = *range.leaf;
+  auto position = writeHandle<Vec3f, PositionCodec>(leaf, "P");
+  auto scale = writeHandle<Vec3f, ExactCodec>(leaf, "scale");
+  auto orient = writeHandle<Quats, ExactCodec>(leaf, "orient");
+  auto alpha = writeHandle<float, UnitCodec>(leaf, "GS_Alpha");
+  auto colour = writeHandle<Vec3f, HalfCodec>(leaf, "Cd");
+  auto probability = writeHandle<float, ExactCodec>(leaf, "probability");
+  auto completed = leaf.groupWriteHandle("completed");
+  const size_t coefficients = size_t(g.shCoefficients());
+  for (size_t i = range.begin; i < range.end; ++i) {
+    const size_t row = size_t(placed[i].row);
+    const auto n = openvdb::Index(i - range.begin);
+    const Eigen::Vector3f& mean = g.mean[row];
+    const openvdb::Vec3d p_index =
+        transform.worldToIndex(openvdb::Vec3d(mean.x(), mean.y(), mean.z()));
+    position.set(n, Vec3f(p_index - openvdb::Coord::round(p_index).asVec3d() + 0.5 * kFixedStep));
+    const Eigen::Vector3f sigma = g.log_scale[row].array().exp();
+    scale.set(n, Vec3f(sigma.x(), sigma.y(), sigma.z()));
+    const Eigen::Vector4f q = unitRotation(g.rotation[row]);  // w x y z; Houdini has x y z w
+    orient.set(n, Quats(q[1], q[2], q[3], q[0]));
+    alpha.set(n, sigmoid(g.opacity_logit[row]) + 0.5f * kFixedStep);
+    const float* sh = g.sh.data() + row * coefficients * 3;
+    const auto linear = [&](int c) {
+      return std::clamp(linearFromSrgb(0.5f + kSh0 * sh[c]), -kMaxHalf, kMaxHalf);
+    };
+    colour.set(n, Vec3f(linear(0), linear(1), linear(2)));
+    probability.set(n, provenance.probability.empty() ? 1.f : provenance.probability[row]);
+    completed.set(n, !provenance.generated.empty() && provenance.generated[row] != 0);
+  }
+  for (size_t c = 0; c < 3; ++c) {
+    auto values = writeHandle<float, HalfCodec>(leaf, kShNames[c]);
+    for (size_t i = range.begin; i < range.end; ++i) {
+      const float* sh = g.sh.data() + size_t(placed[i].row) * coefficients * 3;
+      for (size_t k = 0; k < coefficients; ++k) {
+        values.set(openvdb::Index(i - range.begin), openvdb::Index(k),
+                   std::clamp(sh[3 * k + c], -kMaxHalf, kMaxHalf));
+      }
+    }
+  }
+}
+
+/// Sorts the rows into leaves and writes their attributes; leaves are independent of each other.
+PointTree::Ptr buildPointTree(const Gaussians& g, const Provenance& provenance,
+                              const std::vector<int64_t>& rows,
+                              const openvdb::math::Transform& transform) {
+  std::vector<PlacedRow> placed(rows.size());
+  tbb::parallel_for(size_t(0), rows.size(), [&](size_t i) {
+    const Eigen::Vector3f& mean = g.mean[size_t(rows[i])];
+    const openvdb::Coord ijk =
+        openvdb::Coord::round(transform.worldToIndex(openvdb::Vec3d(mean.x(), mean.y(), mean.z())));
+    uint64_t leaf = 0;
+    for (int k = 0; k < 3; ++k) {
+      leaf = leaf << (kIndexBits - 2) | uint64_t((ijk[k] + (1 << kIndexBits)) >> 3);
+    }
+    placed[i] = {leaf << 9 | PointLeaf::coordToOffset(ijk), rows[i]};
+  });
+  tbb::parallel_sort(placed.begin(), placed.end());
+
+  auto tree = std::make_shared<PointTree>();
+  std::vector<LeafRows> leaves;
+  for (size_t begin = 0; begin < placed.size();) {
+    const uint64_t leaf = placed[begin].key >> 9;
+    size_t end = begin;
+    while (end < placed.size() && placed[end].key >> 9 == leaf) ++end;
+    openvdb::Coord origin;
+    for (int k = 0; k < 3; ++k) {
+      const uint64_t part = leaf >> ((2 - k) * (kIndexBits - 2)) & ((1 << (kIndexBits - 2)) - 1);
+      origin[k] = int(part << 3) - (1 << kIndexBits);
+    }
+    leaves.push_back({tree->touchLeaf(origin), begin, end});
+    begin = end;
+  }
+  const auto descriptor = openvdb::points::AttributeSet::Descriptor::create(
+      openvdb::points::TypedAttributeArray<Vec3f, PositionCodec>::attributeType());
+  tbb::parallel_for(size_t(0), leaves.size(), [&](size_t l) {
+    PointLeaf& leaf = *leaves[l].leaf;
+    std::vector<PointLeaf::ValueType> offsets(PointLeaf::SIZE);  // end of each voxel's points
+    size_t next = leaves[l].begin;
+    for (size_t v = 0; v < offsets.size(); ++v) {
+      while (next < leaves[l].end && (placed[next].key & 511) == v) ++next;
+      offsets[v] = openvdb::PointDataIndex32(uint32_t(next - leaves[l].begin));
+    }
+    leaf.setOffsets(offsets);
+    leaf.initializeAttributes(descriptor, openvdb::Index(leaves[l].end - leaves[l].begin));
+  });
+  if (leaves.empty()) return tree;
+  openvdb::points::appendAttribute<Vec3f, ExactCodec>(*tree, "scale");
+  openvdb::points::appendAttribute<Quats, ExactCodec>(*tree, "orient");
+  openvdb::points::appendAttribute<float, UnitCodec>(*tree, "GS_Alpha");
+  openvdb::points::appendAttribute<Vec3f, HalfCodec>(*tree, "Cd");
+  for (const char* name : kShNames) {
+    openvdb::points::appendAttribute<float, HalfCodec>(*tree, name, 0.f, kShSlots);
+  }
+  openvdb::points::appendAttribute<float, ExactCodec>(*tree, "probability");
+  openvdb::points::appendGroup(*tree, "completed");
+  tbb::parallel_for(size_t(0), leaves.size(),
+                    [&](size_t l) { fillLeaf(g, provenance, placed, leaves[l], transform); });
+  openvdb::points::compactAttributes(*tree);
+  return tree;
+}
+
+/// Attributes of one leaf of the splat grid, checked, and where its points go in the result.
+struct SplatLeaf {
+  const PointLeaf* leaf;
+  size_t first_row;
+};
+
+template <typename T>
+auto readHandle(const PointLeaf& leaf, const char* name) {
+  // Throws openvdb::TypeError where the attribute has another type.
+  return openvdb::points::AttributeHandle<T>(leaf.constAttributeArray(name));
+}
+
+/// The highest degree with a coefficient other than zero: what files by others leave to be found
+/// out.
+int usedShDegree(const std::vector<SplatLeaf>& leaves) {
+  int used = 0;
+  for (const SplatLeaf& l : leaves) {
+    for (const char* name : kShNames) {
+      const auto values = readHandle<float>(*l.leaf, name);
+      const auto stride = std::min<openvdb::Index>(values.stride(), kShSlots);
+      for (openvdb::Index n = 0; n < values.size(); ++n) {
+        for (openvdb::Index k = stride; k > openvdb::Index(used + 1) * openvdb::Index(used + 1);
+             --k) {
+          if (values.get(n, k - 1) == 0) continue;
+          while ((used + 1) * (used + 1) < int(k)) ++used;
+          break;
+        }
+      }
+    }
+  }
+  return used;
+}
+
+void readLeaf(const SplatLeaf& source, const openvdb::math::Transform& transform, bool has_sh,
+              Gaussians* g, Provenance* provenance) {
+  const PointLeaf& leaf = *source.leaf;
+  const auto& descriptor = leaf.attributeSet().descriptor();
+  const auto position = readHandle<Vec3f>(leaf, "P");
+  const auto scale = readHandle<Vec3f>(leaf, "scale");
+  const auto orient = readHandle<Quats>(leaf, "orient");
+  const auto alpha = readHandle<float>(leaf, "GS_Alpha");
+  openvdb::Index begin = 0;
+  for (openvdb::Index v = 0; v < PointLeaf::SIZE; ++v) {
+    const openvdb::Index end = openvdb::Index(leaf.getValue(v));
+    const openvdb::Vec3d voxel = leaf.offsetToGlobalCoord(v).asVec3d();
+    for (openvdb::Index n = begin; n < end; ++n) {
+      const size_t row = source.first_row + n;
+      const openvdb::Vec3d p = transform.indexToWorld(voxel + openvdb::Vec3d(position.get(n)));
+      g->mean[row] = Eigen::Vector3d(p.x(), p.y(), p.z()).cast<float>();
+      const Vec3f sigma = scale.get(n);
+      g->log_scale[row] = {std::log(sigma.x()), std::log(sigma.y()), std::log(sigma.z())};
+      const Quats q = orient.get(n);
+      g->rotation[row] = {q[3], q[0], q[1], q[2]};
+      g->opacity_logit[row] = logitOf(alpha.get(n));
+    }
+    begin = end;
+  }
+  const size_t coefficients = size_t(g->shCoefficients());
+  if (has_sh) {
+    for (size_t c = 0; c < 3; ++c) {
+      const auto values = readHandle<float>(leaf, kShNames[c]);
+      require(values.stride() >= coefficients, kShNames[c], ": expected at least ", coefficients,
+              " values, found ", values.stride());
+      for (openvdb::Index n = 0; n < begin; ++n) {
+        for (size_t k = 0; k < coefficients; ++k) {
+          g->sh[((source.first_row + n) * coefficients + k) * 3 + c] =
+              values.get(n, openvdb::Index(k));
+        }
+      }
+    }
+  } else {
+    const auto colour = readHandle<Vec3f>(leaf, "Cd");
+    for (openvdb::Index n = 0; n < begin; ++n) {
+      const Vec3f linear = colour.get(n);
+      for (int c = 0; c < 3; ++c) {
+        g->sh[(source.first_row + n) * coefficients * 3 + size_t(c)] =
+            (srgbFromLinear(linear[c]) - 0.5f) / kSh0;
+      }
+    }
+  }
+  if (!provenance) return;
+  if (descriptor.find("probability") != openvdb::points::AttributeSet::INVALID_POS) {
+    const auto probability = readHandle<float>(leaf, "probability");
+    for (openvdb::Index n = 0; n < begin; ++n) {
+      provenance->probability[source.first_row + n] = probability.get(n);
+    }
+  }
+  if (descriptor.hasGroup("completed")) {
+    const auto completed = leaf.groupHandle("completed");
+    for (openvdb::Index n = 0; n < begin; ++n) {
+      provenance->generated[source.first_row + n] = completed.get(n) ? 1 : 0;
+    }
+  }
+}
+
+/// A view of bytes as a stream, without a copy.
+class MemoryBuffer : public std::streambuf {
+ public:
+  explicit MemoryBuffer(const std::vector<uint8_t>& bytes) {
+    char* begin = reinterpret_cast<char*>(const_cast<uint8_t*>(bytes.data()));  // only read
+    setg(begin, begin, begin + bytes.size());
+  }
+
+ protected:
+  pos_type seekoff(off_type offset, std::ios_base::seekdir from, std::ios_base::openmode) override {
+    const off_type base = from == std::ios_base::beg   ? 0
+                          : from == std::ios_base::cur ? gptr() - eback()
+                                                       : egptr() - eback();
+    if (base + offset < 0 || base + offset > egptr() - eback()) return pos_type(off_type(-1));
+    setg(eback(), eback() + base + offset, egptr());
+    return base + offset;
+  }
+  pos_type seekpos(pos_type position, std::ios_base::openmode mode) override {
+    return seekoff(off_type(position), std::ios_base::beg, mode);
+  }
+};
+
+/// The points grid `splats`, or else the first points grid.
+PointGrid::Ptr readPointGrid(const std::vector<uint8_t>& bytes, const std::string& path) {
+  openvdb::initialize();
+  require(checksumMatches(bytes), "readPointsVdb: ", path,
+          ": corrupt (its checksum does not match)");
+  MemoryBuffer buffer(bytes);
+  std::istream in(&buffer);
+  // OpenVDB does not look whether a read succeeded: let the stream throw at its end.
+  in.exceptions(std::ios::failbit | std::ios::badbit | std::ios::eofbit);
+  openvdb::io::Stream stream(in, /*delayLoad=*/false);
+  const openvdb::GridPtrVecPtr grids = stream.getGrids();
+  PointGrid::Ptr chosen;
+  std::string found;
+  for (const openvdb::GridBase::Ptr& grid : *grids) {
+    if (!grid) continue;
+    found += (found.empty() ? "" : ", ") + grid->getName() + " (" + grid->type() + ")";
+    if (grid->isType<PointGrid>() && (!chosen || grid->getName() == "splats")) {
+      chosen = openvdb::gridPtrCast<PointGrid>(grid);
+    }
+  }
+  require(bool(chosen), "readPointsVdb: ", path, ": no splats: expected a points grid, found ",
+          found.empty() ? "no grid" : found);
+  return chosen;
+}
+
+/// Writes to any stream; OpenVDB's File does not look whether everything arrived on the disk.
+class SeekableArchive : public openvdb::io::Archive {
+ public:
+  void writeTo(std::ostream& out, const openvdb::GridCPtrVec& grids) const {
+    openvdb::io::Archive::write(out, grids, /*seekable=*/true, openvdb::MetaMap());
+  }
+};
+
+Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenance* provenance) {
+  std::vector<SplatLeaf> leaves;
+  size_t count = 0;
+  bool has_sh = true;
+  for (auto leaf = grid.tree().cbeginLeaf(); leaf; ++leaf) {
+    const auto& attributes = leaf->attributeSet();
+    const auto has = [&](const char* name) {
+      return attributes.descriptor().find(name) != openvdb::points::AttributeSet::INVALID_POS;
+    };
+    for (const char* name : {"P", "scale", "orient", "GS_Alpha"}) {
+      require(has(name), "readPointsVdb: ", path, ": no splats: points grid ", grid.getName(),
+              " has no attribute ", name,
+              " (expected P scale orient GS_Alpha and GS_SPH_R/G/B or Cd)");
+    }
+    has_sh = has_sh && has(kShNames[0]) && has(kShNames[1]) && has(kShNames[2]);
+    require(has_sh || has("Cd"), "readPointsVdb: ", path, ": no splats: points grid ",
+            grid.getName(), " has no colour (expected GS_SPH_R/G/B or Cd)");
+    leaf->validateOffsets();
+    const size_t points = size_t(leaf->getLastValue());
+    for (size_t a = 0; a < attributes.size(); ++a) {
+      require(attributes.getConst(a)->size() >= points, "readPointsVdb: ", path,
+              ": corrupt: a leaf has ", points, " points but ", attributes.getConst(a)->size(),
+              " values of an attribute");
+    }
+    leaves.push_back({&*leaf, count});
+    count += points;
+  }
+  int degree = 0;
+  if (has_sh && !leaves.empty()) {
+    const auto stored = grid.getMetadata<openvdb::Int32Metadata>("sh_degree");
+    degree = stored ? stored->value() : usedShDegree(leaves);
+    require(degree >= 0 && degree <= 3, "readPointsVdb: ", path, ": expected sh_degree 0-3, found ",
+            degree);
+  }
+  Gaussians g;
+  g.resize(int64_t(count), degree);
+  if (provenance) {
+    provenance->generated.assign(count, 0);
+    provenance->probability.assign(count, 1.f);
+  }
+  tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {
+    readLeaf(leaves[i], grid.transform(), has_sh, &g, provenance);
+  });
+  dropNonFinite(&g, provenance);
+  return g;
+}
+
+}  // namespace
+
+void writePly(const Gaussians& g, const std::string& path, const Eigen::Vector3f& up) {
+  requireConsistent(g);
+  const std::vector<int64_t> rows = writableRows(g);
+  const size_t coefficients = size_t(g.shCoefficients()), rest = coefficients - 1;
+  std::ostringstream header;
+  header << "ply\nformat binary_little_endian 1.0\ncomment Generated by vdb_complete\n"
+         << "comment SplatRenderMode: default\n";
+  if (!up.isZero()) {
+    header << "comment Vertical axis: " << up.x() << ' ' << up.y() << ' ' << up.z() << '\n';
+  }
+  header << "element vertex " << rows.size() << '\n';
+  const auto property = [&](const std::string& name) {
+    header << "property float " << name << '\n';
+  };
+  for (const char* name : {"x", "y", "z", "nx", "ny", "nz"}) property(name);
+  for (int i = 0; i < 3; ++i) property("f_dc_" + std::to_string(i));
+  for (size_t i = 0; i < 3 * rest; ++i) property("f_rest_" + std::to_string(i));
+  property("opacity");
+  for (int i = 0; i < 3; ++i) property("scale_" + std::to_string(i));
+  for (int i = 0; i < 4; ++i) property("rot_" + std::to_string(i));
+  header << "end_header\n";
+
+  static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "floats are copied as they are");
+  const std::string text = header.str();
+  const size_t row_floats = 6 + 3 * coefficients + 1 + 3 + 4;
+  std::vector<char> bytes(text.size() + rows.size() * row_floats * sizeof(float));
+  std::copy(text.begin(), text.end(), bytes.begin());
+  tbb::parallel_for(size_t(0), rows.size(), [&](size_t i) {
+    const size_t row = size_t(rows[i]);
+    std::array<float, 62> values{};
+    float* to = values.data();
+    for (int k = 0; k < 3; ++k) *to++ = g.mean[row][k];
+    to += 3;  // normals stay 0
+    const float* sh = g.sh.data() + row * coefficients * 3;
+    for (size_t c = 0; c < 3; ++c) *to++ = sh[c];
+    for (size_t c = 0; c < 3; ++c) {
+      for (size_t k = 1; k <= rest; ++k) *to++ = sh[3 * k + c];
+    }
+    *to++ = std::clamp(g.opacity_logit[row], -kMaxLogit, kMaxLogit);
+    for (int k = 0; k < 3; ++k) *to++ = g.log_scale[row][k];
+    const Eigen::Vector4f q = unitRotation(g.rotation[row]);
+    for (int k = 0; k < 4; ++k) *to++ = q[k];
+    std::memcpy(bytes.data() + text.size() + i * row_floats * sizeof(float), values.data(),
+                row_floats * sizeof(float));
+  });
+  writeFile("writePly", path, bytes.data(), bytes.size());
+}
+
+Gaussians readPly(const std::string& path) {
+  const std::vector<uint8_t> bytes = readFile("readPly", path, kMaxFileBytes);
+  const PlyHeader header = parsePlyHeader(bytes, path);
+  size_t offset = header.bytes;
+  const PlyElement* vertex = nullptr;
+  for (const PlyElement& element : header.elements) {
+    const bool compressed =
+        element.name == "chunk" ||
+        std::any_of(element.properties.begin(), element.properties.end(),
+                    [](const PlyProperty& p) { return p.name == "packed_position"; });
+    require(!compressed, "readPly: ", path,
+            ": compressed PLY is not supported (expected float properties x y z f_dc_0 ...): "
+            "convert it with splat-transform");
+    const uint64_t available = bytes.size() - offset;
+    require(element.row_bytes == 0 || element.count <= available / element.row_bytes,
+            "readPly: ", path, ": truncated: expected ", element.count, " rows of ",
+            element.row_bytes, " bytes in element ", element.name, ", found ", available, " bytes");
+    if (element.name == "vertex") {
+      vertex = &element;
+      break;
+    }
+    offset += size_t(element.count) * element.row_bytes;
+  }
+  require(vertex, "readPly: ", path, ": not a Gaussian splat: no element vertex");
+  const PlyLayout layout = plyLayout(*vertex, path);
+
+  Gaussians g;
+  g.resize(int64_t(vertex->count), layout.sh_degree);
+  const size_t coefficients = size_t(g.shCoefficients()), rest = coefficients - 1;
+  tbb::parallel_for(size_t(0), size_t(vertex->count), [&](size_t i) {
+    const uint8_t* row = bytes.data() + offset + i * vertex->row_bytes;
+    float* sh = g.sh.data() + i * coefficients * 3;
+    for (size_t c = 0; c < 3; ++c) {
+      g.mean[i][Eigen::Index(c)] = layout.mean[c].read(row);
+      g.log_scale[i][Eigen::Index(c)] = layout.scale[c].read(row);
+      sh[c] = layout.f_dc[c].read(row);
+      for (size_t k = 0; k < rest; ++k) sh[3 * (k + 1) + c] = layout.f_rest[c * rest + k].read(row);
+    }
+    for (size_t k = 0; k < 4; ++k) g.rotation[i][Eigen::Index(k)] = layout.rotation[k].read(row);
+    g.opacity_logit[i] = layout.opacity.read(row);
+  });
+  dropNonFinite(&g, nullptr);
+  return g;
+}
+
+void writePointsVdb(const Gaussians& g, const Provenance& provenance, const std::string& path) {
+  constexpr const char* kOperation = "writePointsVdb";
+  requireConsistent(g);
+  const auto matches = [&](size_t n) { return n == 0 || n == size_t(g.size()); };
+  require(matches(provenance.generated.size()) && matches(provenance.probability.size()),
+          kOperation, ": ", path, ": expected provenance of ", g.size(), " Gaussians, found ",
+          provenance.generated.size(), " and ", provenance.probability.size());
+  std::vector<int64_t> rows = writableRows(g);
+  rows.erase(std::remove_if(rows.begin(), rows.end(),
+                            [&](int64_t row) {  // sigma is stored, not its logarithm
+                              const Eigen::Vector3f sigma = g.log_scale[size_t(row)].array().exp();
+                              return !sigma.allFinite() || !(sigma.minCoeff() > 0);
+                            }),
+             rows.end());
+  openvdb::initialize();
+  std::string bytes;
+  try {
+    const auto transform =
+        openvdb::math::Transform::createLinearTransform(pointsVoxelSize(g, rows));
+    auto grid = PointGrid::create(buildPointTree(g, provenance, rows, *transform));
+    grid->setTransform(transform);
+    grid->setName("splats");
+    grid->setCreator("vdb_complete");
+    grid->insertMeta("point_count", openvdb::Int64Metadata(int64_t(rows.size())));
+    grid->insertMeta("point_attributes",
+                     openvdb::StringMetadata("P scale orient GS_Alpha Cd GS_SPH_R GS_SPH_G "
+                                             "GS_SPH_B probability group:completed"));
+    grid->insertMeta("sh_degree", openvdb::Int32Metadata(g.sh_degree));
+    std::ostringstream archive;
+    SeekableArchive().writeTo(archive, {grid});
+    bytes = archive.str();
+  } catch (const std::exception& error) {
+    throw Error(joinText(kOperation, ": ", path, ": cannot encode: ", error.what()));
+  }
+  bytes += checksumTrailer(bytes.data(), bytes.size());
+  writeFile(kOperation, path, bytes.data(), bytes.size());
+}
+
+Gaussians readPointsVdb(const std::string& path, Provenance* provenance) {
+  const std::vector<uint8_t> bytes = readFile("readPointsVdb", path, kMaxFileBytes);
+  try {
+    return gatherPoints(*readPointGrid(bytes, path), path, provenance);
+  } catch (const Error&) {
+    throw;
+  } catch (const std::exception& error) {  // OpenVDB's own
+    std::string message = error.what();
+    std::replace(message.begin(), message.end(), '\n', ' ');
+    throw Error(joinText("readPointsVdb: ", path, ": corrupt or unreadable: ", message));
+  }
+}
+
+}  // namespace vdbc

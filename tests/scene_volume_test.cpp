@@ -1,0 +1,709 @@
+// Laws of the volume and its files: gravity and walls are found, T^-1 T = id (spec E3), what is
+// written is what is read, `surface` is a distance, and other programs agree.
+#include "vdb/scene_volume.h"
+
+#include <gtest/gtest.h>
+#include <openvdb/io/File.h>
+#include <openvdb/openvdb.h>
+#include <openvdb/tools/Interpolation.h>
+#include <sys/resource.h>
+
+#include <algorithm>
+#include <array>
+#include <csignal>
+#include <cstdlib>
+#include <filesystem>
+#include <fstream>
+#include <map>
+#include <random>
+#include <set>
+
+#include "vdb/grid_instances.h"
+
+namespace vdbc {
+namespace {
+
+namespace fs = std::filesystem;
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+
+// --- an analytic room ---
+
+/// A box seen from inside; `room_from_world` takes world points to the room's axes.
+struct Room {
+  Eigen::AlignedBox3d box;
+  Eigen::Isometry3d room_from_world;
+};
+
+struct Capture {
+  std::vector<Camera> cameras;
+  std::vector<std::vector<float>> depths;
+
+  std::vector<DepthView> views() const {
+    std::vector<DepthView> out;
+    for (size_t i = 0; i < cameras.size(); ++i) out.push_back({cameras[i], depths[i].data()});
+    return out;
+  }
+};
+
+Camera lookAt(const Room& room, const Vector3d& eye_room, const Vector3d& target_room) {
+  const Vector3d z = (target_room - eye_room).normalized();
+  const Vector3d x = z.cross(Vector3d::UnitZ()).normalized();
+  Eigen::Isometry3d room_from_camera = Eigen::Isometry3d::Identity();
+  room_from_camera.linear() << x, z.cross(x), z;
+  room_from_camera.translation() = eye_room;
+  Camera camera{160, 120, 90, 90, 80, 60, room.room_from_world.inverse() * room_from_camera};
+  return camera;
+}
+
+/// Planar depth of the walls: the ray leaves the box at the nearest of its far faces.
+std::vector<float> renderDepth(const Room& room, const Camera& camera) {
+  std::vector<float> depth;
+  const Eigen::Isometry3d room_from_camera = room.room_from_world * camera.world_from_camera;
+  for (int y = 0; y < camera.height; ++y)
+    for (int x = 0; x < camera.width; ++x) {
+      const Vector3d ray =
+          room_from_camera.linear() *
+          Vector3d((x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1);
+      double z = 1e9;
+      for (int axis = 0; axis < 3; ++axis) {
+        const double face = ray[axis] > 0 ? room.box.max()[axis] : room.box.min()[axis];
+        if (ray[axis] != 0)
+          z = std::min(z, (face - room_from_camera.translation()[axis]) / ray[axis]);
+      }
+      depth.push_back(float(z));
+    }
+  return depth;
+}
+
+Capture captureRoom(const Room& room) {
+  Capture capture;
+  const Vector3d centre = room.box.center();
+  for (const Vector3d& offset : {Vector3d(1, 0.3, -0.2), Vector3d(-0.6, 1, -0.1),
+                                 Vector3d(-1, -0.5, 0.1), Vector3d(0.2, -1, 0)}) {
+    capture.cameras.push_back(lookAt(room, centre - 0.5 * offset, centre + offset));
+    capture.depths.push_back(renderDepth(room, capture.cameras.back()));
+  }
+  return capture;
+}
+
+Room roomWith(const Matrix3d& world_from_room, const Vector3d& shift) {
+  Room room{{Vector3d(-2, -1.5, 0), Vector3d(3, 2, 2.6)}, Eigen::Isometry3d::Identity()};
+  room.room_from_world.linear() = world_from_room.transpose();
+  room.room_from_world.translation() = -world_from_room.transpose() * shift;
+  return room;
+}
+
+std::vector<Vector3d> pointsOf(const Capture& capture) {
+  std::vector<Vector3d> points;
+  for (size_t i = 0; i < capture.cameras.size(); ++i) {
+    const Camera& c = capture.cameras[i];
+    for (int y = 0; y < c.height; y += 3)
+      for (int x = 0; x < c.width; x += 3)
+        points.push_back(
+            c.unproject(x + 0.5, y + 0.5, double(capture.depths[i][size_t(y * c.width + x)])));
+  }
+  return points;
+}
+
+double degrees(double radians) { return radians * 180 / M_PI; }
+
+TEST(FitVolume, FindsGravityAndTheYawOfTheWalls) {
+  for (const Vector3d& up : {Vector3d(0, 0, 1), Vector3d(0, 1, 0), Vector3d(-1, 0, 0),
+                             Vector3d(0.2, -0.9, 0.3).normalized()})
+    for (double yaw_deg : {-40.0, -12.5, 0.0, 3.3, 44.0}) {
+      Matrix3d upright;
+      upright.col(2) = up;
+      upright.col(0) = up.cross(Vector3d(0.3, 0.5, -0.7)).normalized();
+      upright.col(1) = up.cross(upright.col(0));
+      const Matrix3d world_from_room =
+          upright * Eigen::AngleAxisd(yaw_deg * M_PI / 180, Vector3d::UnitZ()).toRotationMatrix();
+      const Room room = roomWith(world_from_room, {5, -7, 3});
+      const Capture capture = captureRoom(room);
+      VolumeSettings settings;
+      settings.up = up;
+      const VoxelFrame frame = fitVolume(capture.views(), settings, {});
+      const Matrix3d grid = frame.world_from_grid.linear();
+      EXPECT_LT((grid.transpose() * grid - Matrix3d::Identity()).norm(), 1e-12);
+      EXPECT_NEAR(grid.determinant(), 1, 1e-12);
+      EXPECT_LT((grid.col(2) - up).norm(), 1e-12);
+      // Each grid axis is a room axis, up to quarter turns.
+      const Matrix3d between = world_from_room.transpose() * grid;
+      const double error = std::remainder(degrees(std::atan2(between(1, 0), between(0, 0))), 90);
+      EXPECT_LT(std::abs(error), 0.2) << "yaw " << yaw_deg << " up " << up.transpose();
+    }
+}
+
+TEST(FitVolume, DoesNotTurnWithoutWallsOrWhenToldNotTo) {
+  const Matrix3d turned = Eigen::AngleAxisd(0.4, Vector3d::UnitZ()).toRotationMatrix();
+  const Capture room = captureRoom(roomWith(turned, {0, 0, 0}));
+  VolumeSettings settings;
+  settings.align_walls = false;
+  EXPECT_TRUE(fitVolume(room.views(), settings, {})
+                  .world_from_grid.isApprox(Eigen::Isometry3d::Identity()));
+
+  // A sphere from inside: every direction is as good as another.
+  Capture sphere;
+  for (double angle : {0.0, 1.6, 3.1, 4.7}) {
+    sphere.cameras.push_back(lookAt(roomWith(Matrix3d::Identity(), {0, 0, 0}), {0, 0, 0},
+                                    {std::cos(angle), std::sin(angle), 0}));
+    const Camera& c = sphere.cameras.back();
+    std::vector<float> depth;
+    for (int y = 0; y < c.height; ++y)
+      for (int x = 0; x < c.width; ++x)
+        depth.push_back(
+            float(3 / Vector3d((x + 0.5 - c.cx) / c.fx, (y + 0.5 - c.cy) / c.fy, 1).norm()));
+    sphere.depths.push_back(depth);
+  }
+  EXPECT_TRUE(
+      fitVolume(sphere.views(), {}, {}).world_from_grid.isApprox(Eigen::Isometry3d::Identity()));
+}
+
+TEST(FitVolume, HoldsCamerasAndPointsTightlyInWholeCoarseNodes) {
+  const Matrix3d turned = Eigen::AngleAxisd(0.3, Vector3d::UnitZ()).toRotationMatrix();
+  const Room room = roomWith(turned, {100, -50, 10});
+  const Capture capture = captureRoom(room);
+  for (float voxel_m : {0.1f, 0.03f}) {
+    VolumeSettings settings;
+    settings.voxel_m = voxel_m;
+    const VoxelFrame frame = fitVolume(capture.views(), settings, {});
+    const auto inside = [&](const Vector3d& p) {
+      return frame.bounds.isInside(Coord::floor(
+          openvdb::Vec3d(frame.toIndex(p).x(), frame.toIndex(p).y(), frame.toIndex(p).z())));
+    };
+    for (const Vector3d& p : pointsOf(capture)) ASSERT_TRUE(inside(p)) << p.transpose();
+    for (const Camera& c : capture.cameras) EXPECT_TRUE(inside(c.world_from_camera.translation()));
+    const Vector3d extent = room.box.sizes() + 2 * Vector3d(1, 1, 0.2);
+    std::array<int, 3> dims{frame.bounds.dim().x(), frame.bounds.dim().y(), frame.bounds.dim().z()};
+    if (std::abs(frame.world_from_grid.linear().col(0).dot(turned.col(0))) < 0.5)
+      std::swap(dims[0], dims[1]);
+    for (int axis = 0; axis < 3; ++axis) {
+      EXPECT_EQ(dims[size_t(axis)] % 4, 0);
+      EXPECT_EQ(frame.bounds.min()[axis] & 3, 0);
+      // Not larger than the room with its margins and a coarse node at each side; the turn is found
+      // to 0.2 degrees, which is 2 cm here.
+      EXPECT_LE(dims[size_t(axis)] * double(voxel_m), extent[axis] + 8 * double(voxel_m) + 0.04);
+    }
+  }
+}
+
+TEST(FitVolume, OutliersDoNotGrowTheVolume) {
+  Capture capture = captureRoom(roomWith(Matrix3d::Identity(), {0, 0, 0}));
+  const VoxelFrame clean = fitVolume(capture.views(), {}, {});
+  CarveSettings keep_all;
+  keep_all.flying_pixel_ratio = 0;
+  for (auto& depth : capture.depths)
+    for (size_t i = 0; i < depth.size(); i += 401) depth[i] = 18.f;
+  const VoxelFrame dirty = fitVolume(capture.views(), {}, keep_all);
+  for (int axis = 0; axis < 3; ++axis) {
+    EXPECT_LE(std::abs(clean.bounds.min()[axis] - dirty.bounds.min()[axis]), 4);
+    EXPECT_LE(std::abs(clean.bounds.max()[axis] - dirty.bounds.max()[axis]), 4);
+  }
+}
+
+TEST(FitVolume, BoundsOfTheUserAreTheVolume) {
+  const Matrix3d turned = Eigen::AngleAxisd(0.3, Vector3d::UnitZ()).toRotationMatrix();
+  const Capture capture = captureRoom(roomWith(turned, {0, 0, 0}));
+  VolumeSettings settings;
+  settings.bounds = Eigen::AlignedBox3d(Vector3d(-2, -1.2, 0), Vector3d(2, 1.2, 2.8));
+  VoxelFrame frame = fitVolume(capture.views(), settings, {});
+  EXPECT_TRUE(frame.world_from_grid.isApprox(Eigen::Isometry3d::Identity()));
+  EXPECT_EQ(frame.bounds, CoordBBox(Coord(-20, -12, 0), Coord(19, 11, 27)));
+  settings.up = Vector3d::UnitY();  // the same box; grid z is world y, grid y is world -z
+  frame = fitVolume(capture.views(), settings, {});
+  EXPECT_EQ(frame.bounds, CoordBBox(Coord(-20, -28, -12), Coord(19, -1, 11)));
+}
+
+TEST(FitVolume, InverseTransformIsExact) {
+  const Capture capture = captureRoom(roomWith(
+      Eigen::AngleAxisd(0.7, Vector3d(1, 2, 3).normalized()).toRotationMatrix(), {100, 20, -30}));
+  VolumeSettings settings;
+  settings.up = Vector3d(0.3, -0.5, 0.8).normalized();
+  const VoxelFrame frame = fitVolume(capture.views(), settings, {});
+  std::mt19937 random(1);
+  std::uniform_real_distribution<double> metres(-200, 200);
+  for (int i = 0; i < 1000; ++i) {
+    const Vector3d p(metres(random), metres(random), metres(random));
+    EXPECT_LT((frame.toWorld(frame.toIndex(p)) - p).norm(), 1e-6);
+    EXPECT_LT((frame.toIndex(frame.toWorld(p)) - p).norm(), 1e-6);
+  }
+}
+
+TEST(FitVolume, BadInputThrows) {
+  Capture capture = captureRoom(roomWith(Matrix3d::Identity(), {0, 0, 0}));
+  VolumeSettings settings;
+  EXPECT_THROW(fitVolume({}, settings, {}), Error);
+  for (float voxel_m : {0.f, -1.f, NAN, 1e-4f}) {
+    settings.voxel_m = voxel_m;
+    EXPECT_THROW(fitVolume(capture.views(), settings, {}), Error) << voxel_m;
+  }
+  settings = {};
+  settings.up = Vector3d::Zero();
+  EXPECT_THROW(fitVolume(capture.views(), settings, {}), Error);
+  settings = {};
+  settings.bounds = Eigen::AlignedBox3d(Vector3d(1, 1, 1), Vector3d(0, 0, 0));
+  EXPECT_THROW(fitVolume(capture.views(), settings, {}), Error);
+  const Capture far = captureRoom(roomWith(Matrix3d::Identity(), {1e9, 0, 0}));
+  EXPECT_THROW(fitVolume(far.views(), {}, {}), Error);
+  for (auto& depth : capture.depths) std::fill(depth.begin(), depth.end(), 0.f);
+  EXPECT_THROW(fitVolume(capture.views(), {}, {}), Error);
+}
+
+// --- files ---
+
+struct TemporaryFolder {
+  fs::path path;
+  TemporaryFolder() {
+    std::string name = (fs::temp_directory_path() / "scene_volume_test.XXXXXX").string();
+    path = mkdtemp(name.data());
+  }
+  ~TemporaryFolder() { fs::remove_all(path); }
+  std::string operator/(const std::string& name) const { return (path / name).string(); }
+};
+
+VoxelFrame turnedFrame() {
+  VoxelFrame frame;
+  frame.voxel_m = 0.05f;
+  frame.world_from_grid.linear() =
+      Eigen::AngleAxisd(0.5, Vector3d(0.1, -0.2, 1).normalized()).toRotationMatrix();
+  frame.world_from_grid.translation() = Vector3d(3, -4, 1.5);
+  frame.bounds = CoordBBox(Coord(-24, -24, -24), Coord(23, 23, 23));
+  return frame;
+}
+
+/// A one-voxel-thick shell around the centre of the volume (closed by faces), half of it generated,
+/// and its inside seen empty.
+SceneVoxels shellScene(const VoxelFrame& frame, double radius) {
+  SceneVoxels voxels;
+  voxels.frame = frame;
+  std::mt19937 random(2);
+  std::uniform_real_distribution<float> unit(0, 1);
+  const openvdb::Vec3d centre = frame.bounds.getCenter();
+  const auto isBall = [&](const Coord& c) { return (c.asVec3d() - centre).length() < radius; };
+  for (const Coord& c : frame.bounds) {
+    if (!isBall(c)) continue;
+    bool skin = false;
+    for (int axis = 0; axis < 3; ++axis)
+      for (int side : {-1, 1}) {
+        Coord next = c;
+        next[axis] += side;
+        skin = skin || !isBall(next);
+      }
+    if (!skin) {
+      voxels.empty.setValueOn(c);
+      continue;
+    }
+    const bool observed = c.x() < centre.x() + 2;
+    voxels.ijk.push_back(c);
+    voxels.colour_linear.emplace_back(unit(random), unit(random), unit(random));
+    voxels.density.push_back(unit(random));
+    voxels.observed.push_back(observed);
+    voxels.probability.push_back(observed ? 1.f : unit(random));
+    voxels.bfs_level.push_back(observed ? 0 : 1 + c.x() % 5);
+  }
+  voxels.empty.prune();
+  return voxels;
+}
+
+using Row = std::tuple<float, float, float, float, int, float, int>;
+std::map<Coord, Row> rowsOf(const SceneVoxels& v) {
+  std::map<Coord, Row> rows;
+  for (size_t i = 0; i < v.ijk.size(); ++i)
+    rows[v.ijk[i]] = {v.colour_linear[i].x(), v.colour_linear[i].y(), v.colour_linear[i].z(),
+                      v.density[i],           v.observed[i],          v.probability[i],
+                      v.bfs_level[i]};
+  return rows;
+}
+
+std::set<Coord> emptyOf(const SceneVoxels& v) {
+  const std::vector<Coord> coords = activeCoords(v.empty);
+  return {coords.begin(), coords.end()};
+}
+
+TEST(SceneVdb, RoundTripIsExact) {
+  const TemporaryFolder folder;
+  for (bool turned : {false, true}) {
+    VoxelFrame frame = turnedFrame();
+    if (!turned) frame.world_from_grid = Eigen::Isometry3d::Identity();
+    const SceneVoxels before = shellScene(frame, 15.5);
+    writeSceneVdb(before, folder / "a.vdb");
+    const SceneVoxels after = readSceneVdb(folder / "a.vdb");
+    EXPECT_EQ(after.ijk.size(), before.ijk.size());
+    EXPECT_EQ(rowsOf(after), rowsOf(before));
+    EXPECT_EQ(emptyOf(after), emptyOf(before));
+    EXPECT_EQ(after.frame.bounds, frame.bounds);
+    EXPECT_EQ(after.frame.voxel_m, frame.voxel_m);
+    EXPECT_LT((after.frame.world_from_grid.matrix() - frame.world_from_grid.matrix()).norm(),
+              1e-12);
+  }
+  EXPECT_EQ(std::distance(fs::directory_iterator(folder.path), fs::directory_iterator()), 1);
+}
+
+TEST(SceneVdb, EmptySceneRoundTrips) {
+  const TemporaryFolder folder;
+  SceneVoxels voxels;
+  voxels.frame = turnedFrame();
+  writeSceneVdb(voxels, folder / "a.vdb");
+  EXPECT_TRUE(readSceneVdb(folder / "a.vdb").ijk.empty());
+}
+
+TEST(SceneVdb, OtherReadersFindStandardGridsInTheRightPlace) {
+  const TemporaryFolder folder;
+  const SceneVoxels voxels = shellScene(turnedFrame(), 12.5);
+  writeSceneVdb(voxels, folder / "a.vdb");
+  openvdb::initialize();
+  openvdb::io::File file(folder / "a.vdb");
+  file.open(false);
+  const auto grids = file.getGrids();
+  const auto metadata = file.getMetadata();
+  file.close();
+
+  std::map<std::string, openvdb::GridBase::Ptr> by_name;
+  for (const auto& grid : *grids) by_name[grid->getName()] = grid;
+  const std::map<std::string, std::string> types = {
+      {"surface", "Tree_float_5_4_3"},   {"density", "Tree_float_5_4_3"},
+      {"Cd", "Tree_vec3s_5_4_3"},        {"observed", "Tree_bool_5_4_3"},
+      {"generated", "Tree_bool_5_4_3"},  {"probability", "Tree_float_5_4_3"},
+      {"bfs_level", "Tree_float_5_4_3"}, {"seen_empty", "Tree_bool_5_4_3"}};
+  EXPECT_EQ(by_name.size(), types.size());
+  for (const auto& [name, type] : types) {
+    ASSERT_TRUE(by_name.count(name)) << name;
+    const openvdb::GridBase& grid = *by_name[name];
+    EXPECT_EQ(grid.type(), type);
+    EXPECT_EQ(grid.getCreator(), "vdb_complete");
+    EXPECT_TRUE(grid.transform().isLinear());
+    EXPECT_NEAR(grid.voxelSize()[0], 0.05, 1e-7);
+    EXPECT_TRUE(grid.getMetadata<openvdb::Vec3IMetadata>("file_bbox_min")) << name;
+  }
+  EXPECT_EQ(by_name["surface"]->getGridClass(), openvdb::GRID_LEVEL_SET);
+  EXPECT_EQ(by_name["density"]->getGridClass(), openvdb::GRID_FOG_VOLUME);
+  EXPECT_NEAR(openvdb::gridPtrCast<FloatGrid>(by_name["surface"])->background(), 0.15, 1e-6);
+  EXPECT_EQ(metadata->metaValue<int64_t>("observed_count") +
+                metadata->metaValue<int64_t>("generated_count"),
+            int64_t(voxels.ijk.size()));
+
+  // Grid index ijk is the centre of voxel ijk.
+  const Vector3d centre = voxels.frame.toWorld(Vector3d(3.5, -2.5, 7.5));
+  const openvdb::Vec3d found = by_name["density"]->indexToWorld(Coord(3, -3, 7));
+  EXPECT_LT((Vector3d(found[0], found[1], found[2]) - centre).norm(), 1e-9);
+}
+
+TEST(SceneVdb, SurfaceIsTheSignedDistanceToTheVoxels) {
+  const TemporaryFolder folder;
+  // Any scatter of cells: thin, thick and touching in every way.
+  SceneVoxels voxels;
+  voxels.frame = turnedFrame();
+  std::mt19937 random(3);
+  for (const Coord& c : CoordBBox(Coord(-6, -7, -5), Coord(9, 4, 6))) {
+    const bool solid = c.x() < -1 && c.y() < 0;
+    if (!solid && random() % 9 != 0) continue;
+    voxels.ijk.push_back(c);
+  }
+  const size_t n = voxels.ijk.size();
+  voxels.colour_linear.assign(n, Eigen::Vector3f::Ones());
+  voxels.density.assign(n, 1.f);
+  voxels.observed.assign(n, 1);
+  voxels.probability.assign(n, 1.f);
+  voxels.bfs_level.assign(n, 0);
+  writeSceneVdb(voxels, folder / "a.vdb");
+  openvdb::io::File file(folder / "a.vdb");
+  file.open(false);
+  const auto surface = openvdb::gridPtrCast<FloatGrid>(file.readGrid("surface"));
+
+  const std::set<Coord> solid(voxels.ijk.begin(), voxels.ijk.end());
+  const auto accessor = surface->getConstAccessor();
+  int active = 0;
+  for (const Coord& c : CoordBBox(Coord(-12, -13, -11), Coord(15, 10, 12))) {
+    const bool inside = solid.count(c);
+    double best2 = 9;
+    for (const Coord& d : CoordBBox(Coord(-3), Coord(3))) {
+      if (bool(solid.count(c + d)) == inside) continue;
+      double distance2 = 0;
+      for (int axis = 0; axis < 3; ++axis)
+        distance2 += std::pow(std::max(std::abs(d[axis]) - 0.5, 0.0), 2);
+      best2 = std::min(best2, distance2);
+    }
+    const double expected = (inside ? -1 : 1) * std::sqrt(best2) * 0.05;
+    ASSERT_NEAR(double(accessor.getValue(c)), expected, 1e-6) << c;
+    ASSERT_EQ(accessor.isValueOn(c), best2 < 9) << c;
+    active += best2 < 9;
+  }
+  EXPECT_EQ(surface->activeVoxelCount(), uint64_t(active));
+}
+
+TEST(SceneVdb, GeneratedVoxelsDoNotCloseWhatWasSeenEmpty) {
+  const TemporaryFolder folder;
+  SceneVoxels voxels = shellScene(turnedFrame(), 8.5);
+  const auto generated = size_t(std::find(voxels.observed.begin(), voxels.observed.end(), 0) -
+                                voxels.observed.begin());
+  const auto observed = size_t(std::find(voxels.observed.begin(), voxels.observed.end(), 1) -
+                               voxels.observed.begin());
+  voxels.empty.setValueOn(voxels.ijk[generated]);
+  voxels.empty.setValueOn(voxels.ijk[observed]);  // what was observed stays
+  writeSceneVdb(voxels, folder / "a.vdb");
+  openvdb::io::File file(folder / "a.vdb");
+  file.open(false);
+  const auto surface = openvdb::gridPtrCast<FloatGrid>(file.readGrid("surface"));
+  EXPECT_GT(surface->tree().getValue(voxels.ijk[generated]), 0.f);
+  EXPECT_LT(surface->tree().getValue(voxels.ijk[observed]), 0.f);
+}
+
+std::string bytesOf(const std::string& path) {
+  std::ifstream in(path, std::ios::binary);
+  return {std::istreambuf_iterator<char>(in), {}};
+}
+void writeBytes(const std::string& path, const std::string& bytes) {
+  std::ofstream(path, std::ios::binary | std::ios::trunc) << bytes;
+}
+
+/// Small, and in one node of the root: quick to read often.
+SceneVoxels smallScene() {
+  VoxelFrame frame = turnedFrame();
+  frame.bounds = CoordBBox(Coord(0), Coord(11));
+  return shellScene(frame, 4.5);
+}
+constexpr size_t kTrailerBytes = 16;
+
+TEST(SceneVdb, EveryTruncationThrows) {
+  const TemporaryFolder folder;
+  writeSceneVdb(smallScene(), folder / "a.vdb");
+  const std::string bytes = bytesOf(folder / "a.vdb");
+  ASSERT_GT(bytes.size(), 1000u);
+  const size_t grids = bytes.size() - kTrailerBytes;
+  for (size_t n = 0; n < grids; n += n < 300 || n + 8 > grids ? 1 : 307) {
+    writeBytes(folder / "cut.vdb", bytes.substr(0, n));
+    EXPECT_THROW(readSceneVdb(folder / "cut.vdb"), Error) << n << " of " << bytes.size();
+  }
+}
+
+TEST(SceneVdb, EveryCorruptionThrows) {
+  const TemporaryFolder folder;
+  writeSceneVdb(smallScene(), folder / "a.vdb");
+  const std::string bytes = bytesOf(folder / "a.vdb");
+  std::mt19937 random(4);
+  for (int i = 0; i < 300; ++i) {
+    std::string bad = bytes;
+    const size_t at = random() % (bad.size() - kTrailerBytes);
+    bad[at] = char(bad[at] ^ (1 << i % 8));
+    writeBytes(folder / "bad.vdb", bad);
+    EXPECT_THROW(readSceneVdb(folder / "bad.vdb"), Error) << "byte " << at;
+  }
+}
+
+TEST(SceneVdb, FilesWrittenAgainByOthersAreRead) {
+  const TemporaryFolder folder;
+  const SceneVoxels before = smallScene();
+  writeSceneVdb(before, folder / "a.vdb");
+  openvdb::io::File file(folder / "a.vdb");
+  file.open(false);
+  openvdb::io::File(folder / "b.vdb").write(*file.getGrids(), *file.getMetadata());
+  EXPECT_EQ(rowsOf(readSceneVdb(folder / "b.vdb")), rowsOf(before));
+}
+
+TEST(SceneVdb, ForeignFilesWithNonsenseThrow) {
+  const TemporaryFolder folder;
+  writeSceneVdb(smallScene(), folder / "a.vdb");
+  const auto rejects = [&](auto change) {
+    openvdb::io::File file(folder / "a.vdb");
+    file.open(false);
+    const auto grids = file.getGrids();
+    openvdb::MetaMap metadata = *file.getMetadata();
+    std::map<std::string, openvdb::GridBase::Ptr> by_name;
+    for (const auto& grid : *grids) by_name[grid->getName()] = grid;
+    change(by_name, metadata);
+    openvdb::GridPtrVec changed;
+    for (const auto& [name, grid] : by_name) changed.push_back(grid);
+    openvdb::io::File(folder / "b.vdb").write(changed, metadata);
+    EXPECT_THROW(readSceneVdb(folder / "b.vdb"), Error);
+  };
+  using Grids = std::map<std::string, openvdb::GridBase::Ptr>;
+  using openvdb::MetaMap;
+  const auto floats = [](Grids& g, const char* name) -> FloatGrid& {
+    return *openvdb::gridPtrCast<FloatGrid>(g[name]);
+  };
+  for (const char* name : {"density", "Cd", "observed", "probability", "bfs_level", "seen_empty"})
+    rejects([&](Grids& g, MetaMap&) { g.erase(name); });
+  rejects([](Grids& g, MetaMap&) {
+    g["density"]->setTransform(g["density"]->transform().copy()),
+        g["density"]->transform().postTranslate({1, 0, 0});
+  });
+  rejects([](Grids& g, MetaMap&) {
+    for (auto& [name, grid] : g) grid->transform().postScale({1, 2, 1});
+  });
+  rejects(
+      [&](Grids& g, MetaMap&) { floats(g, "density").tree().setValueOn(Coord(99, 0, 0), 1.f); });
+  // One tile in a few bytes: 4,096^3 voxels.
+  rejects([&](Grids& g, MetaMap&) { floats(g, "density").tree().addTile(2, Coord(0), 1.f, true); });
+  const Coord voxel = smallScene().ijk[0];
+  rejects([&](Grids& g, MetaMap&) { floats(g, "bfs_level").tree().setValueOn(voxel, -1.f); });
+  rejects([&](Grids& g, MetaMap&) { floats(g, "probability").tree().setValueOn(voxel, NAN); });
+  rejects([](Grids&, MetaMap& m) { m.insertMeta("voxel_m", openvdb::FloatMetadata(0.07f)); });
+  rejects([](Grids&, MetaMap& m) { m.insertMeta("voxel_m", openvdb::FloatMetadata(NAN)); });
+  rejects([](Grids&, MetaMap& m) { m.removeMeta("volume_max"); });
+  rejects([](Grids&, MetaMap& m) {
+    m.insertMeta("volume_max", openvdb::Vec3IMetadata({2147483647, 11, 11}));
+  });
+}
+
+TEST(SceneVdb, OtherFilesThrow) {
+  const TemporaryFolder folder;
+  EXPECT_THROW(readSceneVdb(folder / "missing.vdb"), Error);
+  EXPECT_THROW(readSceneVdb(folder.path.string()), Error);
+  writeBytes(folder / "text.vdb", "not a volume at all, but some words of text\n");
+  EXPECT_THROW(readSceneVdb(folder / "text.vdb"), Error);
+  // A good VDB that is not ours, and one of ours that lacks a grid.
+  openvdb::initialize();
+  auto grid = FloatGrid::create();
+  grid->setName("density");
+  openvdb::io::File(folder / "other.vdb").write(openvdb::GridPtrVec{grid});
+  EXPECT_THROW(readSceneVdb(folder / "other.vdb"), Error);
+}
+
+TEST(SceneVdb, BadScenesThrow) {
+  const TemporaryFolder folder;
+  const auto rejects = [&](auto change) {
+    SceneVoxels voxels = shellScene(turnedFrame(), 4.5);
+    change(voxels);
+    EXPECT_THROW(writeSceneVdb(voxels, folder / "a.vdb"), Error);
+  };
+  rejects([](SceneVoxels& v) { v.density.pop_back(); });
+  rejects([](SceneVoxels& v) { v.ijk[0] = v.ijk[1]; });
+  rejects([](SceneVoxels& v) { v.ijk[0] = Coord(1000, 0, 0); });
+  rejects([](SceneVoxels& v) { v.probability[3] = NAN; });
+  rejects([](SceneVoxels& v) { v.frame.voxel_m = 0; });
+  EXPECT_TRUE(fs::is_empty(folder.path));
+}
+
+TEST(SceneVdb, FailedWritesThrowAndLeaveNothing) {
+  const TemporaryFolder folder;
+  const SceneVoxels voxels = shellScene(turnedFrame(), 12.5);
+  EXPECT_THROW(writeSceneVdb(voxels, folder / "no/such/folder/a.vdb"), Error);
+  fs::create_directory(folder / "taken.vdb");
+  writeBytes(folder / "taken.vdb/file", "x");
+  EXPECT_THROW(writeSceneVdb(voxels, folder / "taken.vdb"), Error);
+
+  // A full disk, as a limit on the size of files.
+  rlimit before{};
+  getrlimit(RLIMIT_FSIZE, &before);
+  rlimit small = before;
+  small.rlim_cur = 4096;
+  const auto handler = std::signal(SIGXFSZ, SIG_IGN);
+  setrlimit(RLIMIT_FSIZE, &small);
+  EXPECT_THROW(writeSceneVdb(voxels, folder / "full.vdb"), Error);
+  setrlimit(RLIMIT_FSIZE, &before);
+  std::signal(SIGXFSZ, handler);
+  EXPECT_EQ(std::distance(fs::directory_iterator(folder.path), fs::directory_iterator()), 1);
+}
+
+// --- other programs ---
+
+/// Standard output and error of a command, or nothing where it failed.
+std::string outputOf(const std::string& command) {
+  std::string text;
+  FILE* pipe = popen((command + " 2>&1").c_str(), "r");
+  if (!pipe) return {};
+  std::array<char, 4096> buffer;
+  while (size_t n = fread(buffer.data(), 1, buffer.size(), pipe)) text.append(buffer.data(), n);
+  return pclose(pipe) == 0 ? text : std::string();
+}
+
+bool installed(const std::string& program) { return !outputOf("command -v " + program).empty(); }
+
+TEST(SceneVdb, VdbPrintOpensIt) {
+  if (!installed("vdb_print")) GTEST_SKIP() << "vdb_print is not installed";
+  const TemporaryFolder folder;
+  const SceneVoxels voxels = shellScene(turnedFrame(), 12.5);
+  writeSceneVdb(voxels, folder / "a.vdb");
+  const std::string text = outputOf("vdb_print -l " + folder / "a.vdb");
+  for (const char* name : {"surface", "density", "Cd", "observed", "generated", "probability",
+                           "bfs_level", "seen_empty", "level set", "fog volume"})
+    EXPECT_NE(text.find(name), std::string::npos) << name << " in\n" << text;
+}
+
+TEST(SceneVdb, BlenderSeesTheGridsInPlaceAndAClosedSurface) {
+  if (!installed("blender")) GTEST_SKIP() << "blender is not installed";
+  const TemporaryFolder folder;
+  const SceneVoxels voxels = shellScene(turnedFrame(), 12.5);
+  writeSceneVdb(voxels, folder / "a.vdb");
+  std::ofstream(folder / "look.py") << R"(
+import bpy, bmesh, sys
+path = sys.argv[-1]
+bpy.ops.object.volume_import(filepath=path)
+volume = bpy.context.object
+grids = volume.data.grids
+grids.load()
+for grid in grids:
+    print('GRID', grid.name, grid.data_type)
+    if grid.name == 'surface':
+        print('MATRIX', *[x for row in grid.matrix_object for x in row])
+# Only the surface, as Blender meshes one named grid.
+mesh_object = bpy.data.objects.new('mesh', bpy.data.meshes.new('mesh'))
+bpy.context.collection.objects.link(mesh_object)
+modifier = mesh_object.modifiers.new('mesh', 'VOLUME_TO_MESH')
+modifier.object = volume
+modifier.grid_name = 'surface'
+modifier.threshold = 0.0
+mesh = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
+b = bmesh.new()
+b.from_mesh(mesh)
+print('MESH', len(b.verts), sum(1 for e in b.edges if len(e.link_faces) % 2), b.calc_volume(signed=True))
+lows = [min(v.co[i] for v in b.verts) for i in range(3)]
+highs = [max(v.co[i] for v in b.verts) for i in range(3)]
+print('BOX', *lows, *highs)
+)";
+  const std::string text =
+      outputOf("timeout 120 blender -b --factory-startup -noaudio --python-exit-code 1 -P " +
+               folder / "look.py" + " -- " + folder / "a.vdb");
+  ASSERT_NE(text.find("MESH"), std::string::npos) << text;
+  std::istringstream lines(text);
+  std::string line;
+  std::map<std::string, std::string> grids;
+  while (std::getline(lines, line)) {
+    std::istringstream words(line);
+    std::string kind;
+    words >> kind;
+    if (kind == "GRID") {
+      std::string name;
+      words >> name >> grids[name];
+    } else if (kind == "MATRIX") {  // index to object, column vectors
+      const Vector3d origin = voxels.frame.toWorld(Vector3d::Constant(0.5));
+      const Matrix3d axes = voxels.frame.world_from_grid.linear() * double(voxels.frame.voxel_m);
+      for (int row = 0; row < 4; ++row)
+        for (int col = 0; col < 4; ++col) {
+          double found = 0;
+          words >> found;
+          const double expected = row == 3   ? double(col == 3)
+                                  : col == 3 ? origin[row]
+                                             : axes(row, col);
+          EXPECT_NEAR(found, expected, 1e-5) << row << " " << col;
+        }
+    } else if (kind == "MESH") {
+      int vertices = 0, open_edges = -1;
+      double volume = 0;
+      words >> vertices >> open_edges >> volume;
+      EXPECT_GT(vertices, 1000);
+      EXPECT_EQ(open_edges, 0);
+      // The solid between both sides of the shell: its voxels, corners cut by the mesher.
+      const double voxel_m = double(voxels.frame.voxel_m);
+      const double expected = double(voxels.ijk.size()) * voxel_m * voxel_m * voxel_m;
+      EXPECT_NEAR(std::abs(volume) / expected, 1, 0.15);
+    } else if (kind == "BOX") {
+      Vector3d low, high;
+      words >> low[0] >> low[1] >> low[2] >> high[0] >> high[1] >> high[2];
+      // A ball around the frame's origin. Blender moves the meshes that it makes of volumes by half
+      // a voxel along each world axis (its bug T85312); OpenVDB's own mesher does not.
+      const Vector3d centre = voxels.frame.world_from_grid.translation();
+      EXPECT_LT(((low + high) / 2 - centre).norm(), 0.05 * std::sqrt(0.75) + 0.005);
+      for (int axis = 0; axis < 3; ++axis)
+        EXPECT_NEAR(high[axis] - low[axis], 25 * 0.05, 2.5 * 0.05);
+    }
+  }
+  for (const char* name : {"surface", "density", "probability", "bfs_level"})
+    EXPECT_EQ(grids[name], "FLOAT") << name;
+  for (const char* name : {"observed", "generated", "seen_empty"})
+    EXPECT_EQ(grids[name], "BOOLEAN") << name;
+  EXPECT_EQ(grids["Cd"], "VECTOR_FLOAT");
+}
+
+}  // namespace
+}  // namespace vdbc

@@ -1,0 +1,24 @@
+#pragma once
+// A sparse grid of latents: what the encoder makes, the completer extends and the decoder reads.
+#include <cstdint>
+#include <vector>
+
+#include "vdb/carve.h"
+
+namespace vdbc {
+
+/// N tokens of tree level `level` (1: nodes of 2^3 voxels); arrays are parallel. Spec E10.
+struct LatentGrid {
+  VoxelFrame frame;
+  int level = 1;
+  int dim = 0;                       // latent channels
+  std::vector<Coord> ijk;            // [N] in units of `level`
+  std::vector<float> z;              // [N, dim]
+  std::vector<uint8_t> observed;     // [N] 1: encoded from the views; 0: generated
+  std::vector<float> probability;    // [N] occupancy probability; 1 for observed
+  std::vector<int32_t> bfs_level;    // [N] growth level; 0 for observed
+
+  int64_t size() const { return int64_t(ijk.size()); }
+};
+
+}  // namespace vdbc

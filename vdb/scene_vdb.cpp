@@ -1,0 +1,379 @@
+// The files of scene_volume.h. Slow to compile, like everything that walks several types of trees.
+#include <openvdb/io/Stream.h>
+#include <openvdb/math/Maps.h>
+#include <openvdb/openvdb.h>
+#include <tbb/parallel_for.h>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <sstream>
+
+#include "vdb/file_io.h"
+#include "vdb/grid_instances.h"
+#include "vdb/scene_volume.h"
+
+namespace vdbc {
+namespace {
+
+using Eigen::Matrix3d;
+using Eigen::Vector3d;
+
+constexpr int kBandVoxels = 3;  // half width of `surface`, formats.md 2.3
+
+// Names of the grids and of the file's metadata: the format, shared by writer and reader.
+constexpr const char* kSurface = "surface";
+constexpr const char* kDensity = "density";
+constexpr const char* kColour = "Cd";
+constexpr const char* kObserved = "observed";
+constexpr const char* kGenerated = "generated";
+constexpr const char* kProbability = "probability";
+constexpr const char* kBfsLevel = "bfs_level";
+constexpr const char* kSeenEmpty = "seen_empty";
+constexpr const char* kVoxelM = "voxel_m";
+constexpr const char* kVolumeMin = "volume_min";
+constexpr const char* kVolumeMax = "volume_max";
+
+/// The frame as OpenVDB has it: row vectors, voxel centres at whole indices.
+openvdb::math::Transform::Ptr fileTransform(const VoxelFrame& frame) {
+  const Matrix3d scaled = frame.world_from_grid.linear() * double(frame.voxel_m);
+  const Vector3d centre = frame.toWorld(Vector3d::Constant(0.5));
+  openvdb::Mat4d m = openvdb::Mat4d::identity();
+  for (int row = 0; row < 3; ++row) {
+    for (int col = 0; col < 3; ++col) m[row][col] = scaled(col, row);
+    m[3][row] = centre[row];
+  }
+  // simplify(): without rotation it is a plain scale and translation, which more tools understand.
+  return std::make_shared<openvdb::math::Transform>(
+      openvdb::math::simplify(std::make_shared<openvdb::math::AffineMap>(m)));
+}
+
+/// The frame of a file's transform; throws unless that is a rotation, translation and uniform
+/// scale.
+VoxelFrame frameOf(const openvdb::math::Transform& transform, float voxel_m,
+                   const std::string& path) {
+  require(transform.isLinear(), "readSceneVdb: ", path, ": expected a linear transform");
+  const openvdb::Mat4d m = transform.baseMap()->getAffineMap()->getMat4();
+  Matrix3d rotation;
+  Vector3d centre;
+  for (int row = 0; row < 3; ++row) {
+    for (int col = 0; col < 3; ++col) rotation(col, row) = m[row][col] / double(voxel_m);
+    centre[row] = m[3][row];
+  }
+  const double error = (rotation.transpose() * rotation - Matrix3d::Identity()).norm();
+  require(error < 1e-4 && rotation.determinant() > 0 && centre.allFinite(), "readSceneVdb: ", path,
+          ": expected a rotation with voxels of ", voxel_m, " m, found another transform");
+  VoxelFrame frame;
+  frame.voxel_m = voxel_m;
+  frame.world_from_grid.linear() = rotation;
+  frame.world_from_grid.translation() =
+      centre - rotation * Vector3d::Constant(0.5 * double(voxel_m));
+  return frame;
+}
+
+/// Exact signed distance (world units, negative inside) to the boundary of the union of the active
+/// voxels of `solid`, in a band of kBandVoxels at both sides. Squared distances to boxes add up
+/// over the axes, so three one-dimensional minima per leaf do it (Felzenszwalb and Huttenlocher
+/// 2012, sec. 2.1, with the distance to a cell instead of a point).
+FloatGrid::Ptr boundaryLevelSet(const MaskTree& solid, double voxel_m) {
+  using Leaf = FloatTree::LeafNodeType;
+  constexpr int kReach = kBandVoxels;  // a cell further off is outside the band
+  constexpr int kSide = int(Leaf::DIM) + 2 * kReach;
+  constexpr float kFar = 1e9f;
+  constexpr std::array<float, kReach + 1> kCell2 = {0.f, 0.25f, 2.25f, 6.25f};  // (d - 1/2)^2
+
+  std::vector<Coord> origins;  // of all leaves that the band can touch
+  for (auto leaf = solid.cbeginLeaf(); leaf; ++leaf) {
+    const CoordBBox box = leaf->getNodeBoundingBox();
+    CoordBBox active;
+    leaf->evalActiveBoundingBox(active, false);
+    active.expand(kReach);
+    for (int x = -1; x <= 1; ++x)
+      for (int y = -1; y <= 1; ++y)
+        for (int z = -1; z <= 1; ++z) {
+          const Coord shift(x * int(Leaf::DIM), y * int(Leaf::DIM), z * int(Leaf::DIM));
+          if (CoordBBox(box.min() + shift, box.max() + shift).hasOverlap(active))
+            origins.push_back(box.min() + shift);
+        }
+  }
+  std::sort(origins.begin(), origins.end());
+  origins.erase(std::unique(origins.begin(), origins.end()), origins.end());
+
+  const auto half_width = float(kBandVoxels * voxel_m);
+  std::vector<Leaf*> leaves(origins.size());
+  tbb::parallel_for(size_t(0), origins.size(), [&](size_t i) {
+    using Block = std::array<float, kSide * kSide * kSide>;
+    Block out, in, swap;  // squared distances, voxels: to solid cells, to open cells
+    const openvdb::tree::ValueAccessor<const MaskTree, false> cells(solid);
+    const Coord corner = origins[i].offsetBy(-kReach);
+    for (int x = 0, k = 0; x < kSide; ++x)
+      for (int y = 0; y < kSide; ++y)
+        for (int z = 0; z < kSide; ++z, ++k) {
+          const bool on = cells.isValueOn(corner.offsetBy(x, y, z));
+          out[size_t(k)] = on ? 0.f : kFar;
+          in[size_t(k)] = on ? kFar : 0.f;
+        }
+    for (Block* block : {&out, &in}) {
+      // Each axis in turn, for the leaf's own range of that axis: all neighbours are in the block.
+      Coord low(0), high(kSide);
+      for (int axis = 0, step = kSide * kSide; axis < 3; ++axis, step /= kSide) {
+        low[axis] = kReach;
+        high[axis] = kReach + int(Leaf::DIM);
+        for (int x = low[0]; x < high[0]; ++x)
+          for (int y = low[1]; y < high[1]; ++y)
+            for (int z = low[2], k = (x * kSide + y) * kSide + z; z < high[2]; ++z, ++k) {
+              const float* near = block->data() + k;
+              float best = near[0];
+              for (int d = 1; d <= kReach; ++d)
+                best =
+                    std::min(best, std::min(near[-d * step], near[d * step]) + kCell2[size_t(d)]);
+              swap[size_t(k)] = best;
+            }
+        std::swap(*block, swap);
+      }
+    }
+    auto* leaf = new Leaf(origins[i], half_width, false);
+    for (openvdb::Index offset = 0; offset < Leaf::SIZE; ++offset) {
+      const Coord p = Leaf::offsetToLocalCoord(offset).offsetBy(kReach);
+      const size_t k = size_t((p.x() * kSide + p.y()) * kSide + p.z());
+      const bool solid_here = out[k] == 0.f;
+      const float distance = std::sqrt(solid_here ? in[k] : out[k]) * float(voxel_m);
+      if (distance < half_width)
+        leaf->setValueOn(offset, solid_here ? -distance : distance);
+      else if (solid_here)
+        leaf->setValueOff(offset, -half_width);
+    }
+    leaves[i] = leaf;
+  });
+  auto grid = FloatGrid::create(half_width);
+  for (Leaf* leaf : leaves) grid->tree().addLeaf(leaf);
+  grid->setGridClass(openvdb::GRID_LEVEL_SET);
+  return grid;
+}
+
+/// A grid with one active voxel per entry of `ijk`; value(i) is its value.
+template <typename GridType, typename Value>
+typename GridType::Ptr voxelGrid(const std::vector<Coord>& ijk, const Value& value) {
+  auto grid = GridType::create();
+  auto accessor = grid->getUnsafeAccessor();
+  for (size_t i = 0; i < ijk.size(); ++i)
+    accessor.setValueOn(ijk[i], typename GridType::ValueType(value(i)));
+  return grid;
+}
+
+BoolGrid::Ptr emptyGrid(const TokenMask& empty) {
+  auto grid = BoolGrid::create();
+  auto accessor = grid->getUnsafeAccessor();
+  for (auto value = empty.cbeginValueOn(); value; ++value) {
+    CoordBBox box;
+    value.getBoundingBox(box);
+    if (value.isVoxelValue())
+      accessor.setValueOn(box.min(), true);
+    else
+      grid->tree().sparseFill(box, true, true);
+  }
+  grid->tree().prune();
+  return grid;
+}
+
+void requireWritable(const SceneVoxels& v, const std::string& path) {
+  const size_t n = v.ijk.size();
+  require(v.colour_linear.size() == n && v.density.size() == n && v.observed.size() == n &&
+              v.probability.size() == n && v.bfs_level.size() == n,
+          "writeSceneVdb: ", path, ": arrays of different lengths (expected ", n, ")");
+  require(std::isfinite(v.frame.voxel_m) && v.frame.voxel_m > 0, "writeSceneVdb: ", path,
+          ": expected a positive voxel size, found ", v.frame.voxel_m);
+  for (size_t i = 0; i < n; ++i) {
+    require(v.frame.bounds.isInside(v.ijk[i]), "writeSceneVdb: ", path, ": voxel ", v.ijk[i],
+            " lies outside the volume ", v.frame.bounds);
+    require(v.colour_linear[i].allFinite() && std::isfinite(v.density[i]) &&
+                std::isfinite(v.probability[i]),
+            "writeSceneVdb: ", path, ": voxel ", v.ijk[i], " has a value that is not finite");
+  }
+}
+
+/// Writes to any stream; OpenVDB's File does not look whether everything arrived on the disk.
+class SeekableArchive : public openvdb::io::Archive {
+ public:
+  void writeTo(std::ostream& out, const openvdb::GridPtrVec& grids,
+               const openvdb::MetaMap& metadata) const {
+    openvdb::io::Archive::write(out, grids, /*seekable=*/true, metadata);
+  }
+};
+
+/// All grids and the metadata of a file. A file that ends too early or does not make sense throws.
+openvdb::GridPtrVec readGrids(const std::string& path, openvdb::MetaMap* metadata) {
+  constexpr uint64_t kMaxBytes = uint64_t(1) << 32;
+  const std::vector<uint8_t> bytes = readFile("readSceneVdb", path, kMaxBytes);
+  // OpenVDB trusts the sizes inside a file: flipped bits make it write outside its buffers. Files
+  // that another program wrote again have no checksum.
+  require(checksumMatches(bytes), "readSceneVdb: ", path,
+          ": corrupt (its checksum does not match)");
+  try {
+    // OpenVDB does not look whether a read succeeded; a stream that throws at its end does.
+    std::istringstream in(std::string(bytes.begin(), bytes.end()));
+    in.exceptions(std::ios::failbit | std::ios::badbit | std::ios::eofbit);
+    openvdb::io::Stream stream(in, /*delayLoad=*/false);
+    *metadata = *stream.getMetadata();
+    return *stream.getGrids();
+  } catch (const std::exception& e) {
+    throw Error(
+        joinText("readSceneVdb: ", path,
+                 ": expected a complete OpenVDB file, found one that is cut off, corrupt or "
+                 "of another kind (",
+                 e.what(), ")"));
+  }
+}
+
+template <typename GridType>
+typename GridType::Ptr findGrid(const openvdb::GridPtrVec& grids, const char* name,
+                                const std::string& path) {
+  for (const auto& grid : grids)
+    if (grid && grid->getName() == name) {
+      require(grid->isType<GridType>(), "readSceneVdb: ", path, ": expected grid '", name,
+              "' of type ", GridType::gridType(), ", found ", grid->type());
+      return openvdb::gridPtrCast<GridType>(grid);
+    }
+  throw Error(joinText("readSceneVdb: ", path, ": no grid '", name, "'"));
+}
+
+template <typename Value>
+Value findMetadata(const openvdb::MetaMap& metadata, const char* name, const std::string& path) {
+  using Meta = openvdb::TypedMetadata<Value>;
+  const auto found = metadata.getMetadata<Meta>(name);
+  require(bool(found), "readSceneVdb: ", path, ": no metadata '", name, "' of type ",
+          Meta::staticTypeName());
+  return found->value();
+}
+
+}  // namespace
+
+void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
+  requireWritable(voxels, path);
+  openvdb::initialize();
+
+  MaskTree solid;
+  {
+    openvdb::tree::ValueAccessor<MaskTree, false> cells(solid);
+    const openvdb::tree::ValueAccessor<const TokenMask, false> empty(voxels.empty);
+    for (size_t i = 0; i < voxels.ijk.size(); ++i)
+      if (voxels.observed[i] || !empty.isValueOn(voxels.ijk[i])) cells.setValueOn(voxels.ijk[i]);
+  }
+  const auto& v = voxels;
+  const auto density = voxelGrid<FloatGrid>(v.ijk, [&](size_t i) { return v.density[i]; });
+  require(density->activeVoxelCount() == v.ijk.size(), "writeSceneVdb: ", path, ": expected ",
+          v.ijk.size(), " different voxels, found ", density->activeVoxelCount());
+  density->setGridClass(openvdb::GRID_FOG_VOLUME);
+  const auto colour = voxelGrid<Vec3SGrid>(v.ijk, [&](size_t i) {
+    return openvdb::Vec3f(v.colour_linear[i].x(), v.colour_linear[i].y(), v.colour_linear[i].z());
+  });
+  colour->setVectorType(openvdb::VEC_INVARIANT);
+
+  const std::pair<const char*, openvdb::GridBase::Ptr> named[] = {
+      {kSurface, boundaryLevelSet(solid, double(v.frame.voxel_m))},
+      {kDensity, density},
+      {kColour, colour},
+      {kObserved, voxelGrid<BoolGrid>(v.ijk, [&](size_t i) { return v.observed[i] != 0; })},
+      {kGenerated, voxelGrid<BoolGrid>(v.ijk, [&](size_t i) { return v.observed[i] == 0; })},
+      {kProbability, voxelGrid<FloatGrid>(v.ijk, [&](size_t i) { return v.probability[i]; })},
+      {kBfsLevel, voxelGrid<FloatGrid>(v.ijk, [&](size_t i) { return v.bfs_level[i]; })},
+      {kSeenEmpty, emptyGrid(v.empty)},
+  };
+  openvdb::GridPtrVec grids;
+  const auto transform = fileTransform(v.frame);
+  for (const auto& [name, grid] : named) {
+    grid->setName(name);
+    grid->setCreator("vdb_complete");
+    grid->setTransform(transform);  // one object: OpenVDB keeps it by pointer
+    grids.push_back(grid);
+  }
+  const auto observed =
+      std::count_if(v.observed.begin(), v.observed.end(), [](uint8_t value) { return value != 0; });
+  openvdb::MetaMap metadata;
+  const CoordBBox& bounds = v.frame.bounds;
+  metadata.insertMeta("creator", openvdb::StringMetadata("vdb_complete"));
+  metadata.insertMeta(kVoxelM, openvdb::FloatMetadata(v.frame.voxel_m));
+  metadata.insertMeta(kVolumeMin, openvdb::Vec3IMetadata(bounds.min().asVec3i()));
+  metadata.insertMeta(kVolumeMax, openvdb::Vec3IMetadata(bounds.max().asVec3i()));
+  metadata.insertMeta("observed_count", openvdb::Int64Metadata(int64_t(observed)));
+  metadata.insertMeta("generated_count", openvdb::Int64Metadata(int64_t(v.ijk.size()) - observed));
+
+  std::ostringstream archive;
+  SeekableArchive().writeTo(archive, grids, metadata);
+  std::string bytes = archive.str();
+  bytes += checksumTrailer(bytes.data(), bytes.size());
+
+  writeFile("writeSceneVdb", path, bytes.data(), bytes.size());
+}
+
+SceneVoxels readSceneVdb(const std::string& path) {
+  openvdb::initialize();
+  openvdb::MetaMap metadata;
+  const openvdb::GridPtrVec grids = readGrids(path, &metadata);
+  const auto density = findGrid<FloatGrid>(grids, kDensity, path);
+  const auto colour = findGrid<Vec3SGrid>(grids, kColour, path);
+  const auto observed = findGrid<BoolGrid>(grids, kObserved, path);
+  const auto probability = findGrid<FloatGrid>(grids, kProbability, path);
+  const auto bfs_level = findGrid<FloatGrid>(grids, kBfsLevel, path);
+  const auto empty = findGrid<BoolGrid>(grids, kSeenEmpty, path);
+  for (const openvdb::GridBase::Ptr& grid : grids)
+    require(grid->transform() == density->transform(), "readSceneVdb: ", path, ": grid '",
+            grid->getName(), "' has another transform than 'density'");
+
+  const auto voxel_m = findMetadata<float>(metadata, kVoxelM, path);
+  require(std::isfinite(voxel_m) && voxel_m > 0, "readSceneVdb: ", path,
+          ": expected a positive voxel size, found ", voxel_m);
+  SceneVoxels voxels;
+  voxels.frame = frameOf(density->transform(), voxel_m, path);
+  const Coord low(findMetadata<openvdb::Vec3i>(metadata, kVolumeMin, path));
+  const Coord high(findMetadata<openvdb::Vec3i>(metadata, kVolumeMax, path));
+  for (int axis = 0; axis < 3; ++axis)
+    require(std::abs(int64_t(low[axis])) <= kMaxVolumeIndex && int64_t(low[axis]) <= high[axis] &&
+                int64_t(high[axis]) - low[axis] < kMaxVolumeSide,
+            "readSceneVdb: ", path, ": expected a volume of 1 to ", kMaxVolumeSide,
+            " voxels a side, found ", low, " to ", high);
+  voxels.frame.bounds = CoordBBox(low, high);
+
+  // A few bytes can claim a tile of 4,096^3 voxels: count before taking memory.
+  constexpr uint64_t kMaxVoxels = uint64_t(1) << 27;
+  const uint64_t count = density->activeVoxelCount();
+  require(count <= kMaxVoxels, "readSceneVdb: ", path, ": expected at most ", kMaxVoxels,
+          " voxels, found ", count);
+  voxels.ijk.reserve(count);
+  for (auto value = density->cbeginValueOn(); value; ++value) {
+    CoordBBox box;
+    value.getBoundingBox(box);
+    require(voxels.frame.bounds.isInside(box), "readSceneVdb: ", path, ": voxels ", box,
+            " lie outside the volume ", voxels.frame.bounds);
+    for (const Coord& ijk : box) {
+      voxels.ijk.push_back(ijk);
+      voxels.density.push_back(*value);
+    }
+  }
+  const auto colours = colour->getConstUnsafeAccessor();
+  const auto observeds = observed->getConstUnsafeAccessor();
+  const auto probabilities = probability->getConstUnsafeAccessor();
+  const auto levels = bfs_level->getConstUnsafeAccessor();
+  for (size_t i = 0; i < voxels.ijk.size(); ++i) {
+    const Coord& ijk = voxels.ijk[i];
+    const openvdb::Vec3f c = colours.getValue(ijk);
+    const float p = probabilities.getValue(ijk), level = levels.getValue(ijk);
+    require(std::isfinite(c.lengthSqr()) && std::isfinite(voxels.density[i]) && std::isfinite(p) &&
+                level >= 0 && level <= float(1 << 24),
+            "readSceneVdb: ", path, ": voxel ", ijk, " has a value that makes no sense");
+    voxels.colour_linear.emplace_back(c.x(), c.y(), c.z());
+    voxels.observed.push_back(observeds.getValue(ijk));
+    voxels.probability.push_back(p);
+    voxels.bfs_level.push_back(int32_t(level));
+  }
+  for (auto value = empty->cbeginValueOn(); value; ++value) {
+    CoordBBox box;
+    value.getBoundingBox(box);
+    require(voxels.frame.bounds.isInside(box), "readSceneVdb: ", path, ": empty voxels ", box,
+            " lie outside the volume ", voxels.frame.bounds);
+    voxels.empty.sparseFill(box, true, true);
+  }
+  return voxels;
+}
+
+}  // namespace vdbc
