@@ -168,8 +168,15 @@ DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen
   for (int split = 0; split < c.levels; ++split) {
     const Tensor p = impl_->net->childLogits(tokens, split).sigmoid().contiguous();
     const auto chance = p.accessor<float, 2>();
-    const bool last = split + 1 == c.levels;
     openvdb::tree::ValueAccessor<const TokenMask> filled(seen.filled), empty(seen.empty);
+    const int side = 1 << (c.levels - 1 - split);  // of a child, in voxels
+    auto activeBelow = [&](const auto& mask, const Coord& child) {
+      int active = 0;
+      for (int v = 0; v < side * side * side; ++v)
+        active += mask.isValueOn(Coord(child.x() * side + v / (side * side),
+                                       child.y() * side + v / side % side, child.z() * side + v % side));
+      return active;
+    };
     Children kept;
     for (size_t i = 0; i < coords.size(); ++i) {
       int likeliest = -1;
@@ -182,11 +189,11 @@ DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen
       };
       for (int slot = 0; slot < 8; ++slot) {
         const Coord child = childCoord(coords[i], slot);
-        if (last && filled.isValueOn(child)) {
+        if (activeBelow(filled, child) > 0) {
           keep(slot, 1.f);
           continue;
         }
-        if (last && empty.isValueOn(child)) continue;  // seen empty: stays empty
+        if (activeBelow(empty, child) == side * side * side) continue;  // seen empty: stays empty
         const float q = chance[int64_t(i)][slot];
         if (q > child_threshold) keep(slot, q);
         if (likeliest < 0 || q > chance[int64_t(i)][likeliest]) likeliest = slot;

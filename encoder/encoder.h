@@ -25,7 +25,7 @@ struct EncoderConfig {
   int window = 256;            // tokens per self-attention window
   int latent_dim = 32;
   int latent_groups = 8;       // of the GroupNorm after sampling, per token
-  float kl_weight = 1e-3f;     // beta; image error and KL are both means (spec E12)
+  float kl_weight = 1e-4f;     // beta; image error and KL are both means (spec E12)
   float occupancy_weight = 0.02f;  // of BCE-up
   int gaussians_per_axis = 2;  // M = its cube
   float guide_alpha = -1;      // fixed share of learned attention, or -1: learned, starts at .5

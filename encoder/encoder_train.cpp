@@ -145,6 +145,14 @@ int64_t randomInt(int64_t n, torch::Generator& random) {
   return torch::randint(n, {1}, random).item<int64_t>();
 }
 
+// Condition views and one to hold out are the least that a step can use.
+std::vector<View> viewsOf(const SceneSource& scenes, uint64_t index, size_t least) {
+  std::vector<View> views = scenes(index);
+  require(views.size() >= least, "train: scene ", index, ": expected at least ", least,
+          " views, found ", views.size());
+  return views;
+}
+
 struct Validation {
   double input_psnr = 0, novel_psnr = 0;
 };
@@ -194,16 +202,16 @@ void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_
   auto net = std::make_shared<EncoderNet>(config), average = std::make_shared<EncoderNet>(config);
   Trainer trainer(net, average, "encoder", config.toJson(), settings, listener);
   std::vector<std::vector<View>> held_out;
-  for (int i = 0; i < validation_count; ++i) held_out.push_back(validation(uint64_t(i)));
+  for (int i = 0; i < validation_count; ++i) held_out.push_back(viewsOf(validation, uint64_t(i), 4));
 
   auto sceneOfStep = [&](int64_t step) { return uint64_t(step / kStepsPerScene % scene_count); };
-  std::vector<View> views = scenes(sceneOfStep(trainer.step()));
+  std::vector<View> views = viewsOf(scenes, sceneOfStep(trainer.step()), 3);
   std::future<std::vector<View>> next;
   progress.start("train encoder");
   while (!trainer.done()) {
     const int64_t step = trainer.step();
     if (!next.valid())
-      next = std::async(std::launch::async, scenes, sceneOfStep(step + kStepsPerScene));
+      next = std::async(std::launch::async, viewsOf, scenes, sceneOfStep(step + kStepsPerScene), 3);
     // A generator per step: a resumed run draws what an uninterrupted one would have drawn.
     torch::Generator random = at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(step));
     const std::vector<size_t> order = shuffledIndices(views.size(), random);

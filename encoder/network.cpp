@@ -47,14 +47,14 @@ CountAttention countAttention(const std::vector<int32_t>& rows, const std::vecto
 
 namespace {
 
-// Patches of all views, [P, 3 * px * px], values centred on 0.
+// Patches of all views, [P, 3 * px * px], about unit deviation.
 Tensor patchPixels(const std::vector<View>& views, const Observation& o, int px) {
   std::vector<Tensor> all;
   for (size_t i = 0; i < views.size(); ++i) {
     const PatchLattice& l = o.lattices[i];
     const Image image = resizeImage(views[i].colour, l.columns * px, l.rows * px);
     const Tensor t = torch::from_blob(const_cast<float*>(image.data.data()), {l.rows, px, l.columns, px, 3});
-    all.push_back((t.permute({0, 2, 1, 3, 4}).reshape({l.rows * l.columns, px * px * 3}) - .5f));
+    all.push_back((t.permute({0, 2, 1, 3, 4}).reshape({l.rows * l.columns, px * px * 3}) - .5f) * 4);
   }
   return torch::cat(all);
 }
@@ -173,6 +173,8 @@ EncoderNet::EncoderNet(const EncoderConfig& c) : config(c) {
   for (int b = 0; b < c.blocks; ++b)
     blocks.push_back(register_module("block" + std::to_string(b),
                                      std::make_shared<BidirectionalBlock>(c, b + 1 < c.blocks)));
+  feature_shortcut = register_module("feature_shortcut", nn::Linear(kVoxelFeatures, c.latent_dim));
+  colour_shortcut = register_module("colour_shortcut", nn::Linear(c.latent_dim, 3));
   posterior_norm = register_module("posterior_norm", norm(d));
   posterior = register_module("posterior", nn::Linear(d, 2 * c.latent_dim));
   latent_norm = register_module(
@@ -198,12 +200,42 @@ EncoderNet::EncoderNet(const EncoderConfig& c) : config(c) {
   gaussian_out->weight.mul_(.3);
 }
 
+namespace {
+
+// Colours [..., 3] around 0 as luminance and two differences, scaled to about unit deviation: hues differ by
+// hundredths, and a network that sees them beside brightness learns grey first and colour much later.
+Tensor opponentColours(const Tensor& srgb) {
+  const Tensor y = srgb.mean(-1, true);
+  return torch::cat({(y - .5f) * 4, (srgb.slice(-1, 0, 1) - y) * 12, (srgb.slice(-1, 2, 3) - y) * 12}, -1);
+}
+// The reverse for the network's outputs: display colour less .5.
+Tensor srgbFromOpponent(const Tensor& o) {
+  const Tensor y = o.slice(-1, 0, 1) / 2, r = o.slice(-1, 1, 2), b = o.slice(-1, 2, 3);
+  return torch::cat({y + r, y - r - b, y + b}, -1);
+}
+
+// Voxel features as the first layer sees them; octants without pixels stay 0.
+Tensor scaledFeatures(const Tensor& f) {
+  const Tensor octants = f.slice(1, 0, 32).view({-1, 8, 4}), share = octants.slice(2, 3, 4);
+  const Tensor colours = opponentColours(octants.slice(2, 0, 3)) * (share > 0);
+  return torch::cat({torch::cat({colours, share * 4}, 2).view({-1, 32}),
+                     opponentColours(f.slice(1, 32, 35)), f.slice(1, 35, kVoxelFeatures) * 2}, 1);
+}
+
+}  // namespace
+
 EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
-  Tensor x3 = voxel_in->forward(in.voxel_features);
+  Tensor pooled = scaledFeatures(in.voxel_features);
+  Tensor x3 = voxel_in->forward(pooled);
   for (size_t l = 0; l < aggregate.size(); ++l) {
-    const Tensor padded = torch::cat({x3, torch::zeros({1, x3.size(1)})});
-    x3 = aggregate[l]->forward(
-        padded.index_select(0, in.children[l].flatten()).view({in.children[l].size(0), -1}));
+    const Tensor& children = in.children[l];
+    auto gather = [&](const Tensor& rows) {  // [N, 8, C], absent children 0
+      return torch::cat({rows, torch::zeros({1, rows.size(1)})})
+          .index_select(0, children.flatten()).view({children.size(0), 8, rows.size(1)});
+    };
+    const Tensor present = (children < x3.size(0)).sum(1, true).to(torch::kFloat32);
+    pooled = gather(pooled).sum(1) / present;
+    x3 = aggregate[l]->forward(gather(x3).flatten(1));
   }
   x3 = x3 + position_in->forward(sinusoidalCode(in.positions));
   Tensor x2 = patch_in->forward(in.patches) +
@@ -213,7 +245,7 @@ EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
   const Rotary pos = rotary(in.coords, config.width / config.heads);
   for (size_t b = 0; b < blocks.size(); ++b) blocks[b]->forward(&x3, &x2, in, pos, int(b));
   const auto halves = posterior->forward(posterior_norm->forward(x3)).chunk(2, 1);
-  return {halves[0], halves[1].clamp(-12, 4)};
+  return {halves[0] + feature_shortcut->forward(pooled), halves[1].clamp(-12, 4)};
 }
 
 Tensor EncoderNet::normalise(const Tensor& z) { return latent_norm->forward(z); }
@@ -223,23 +255,25 @@ Tensor EncoderNet::decodeTokens(const Tensor& z, const Tensor& coords, const Ten
   const Rotary pos = rotary(coords, config.width / config.heads);
   for (size_t b = 0; b < decoder_blocks.size(); ++b)
     x = decoder_blocks[b]->forward(x, &pos, order, config.window, b % 2 == 1);
-  return decoder_norm->forward(x);
+  return torch::cat({decoder_norm->forward(x), colour_shortcut->forward(z)}, 1);
 }
 
 Tensor EncoderNet::childLogits(const Tensor& tokens, int split) {
-  return child_logits[size_t(split)]->forward(tokens);
+  return child_logits[size_t(split)]->forward(tokens.slice(1, 0, -3));
 }
 
 Tensor EncoderNet::splitTokens(const Tensor& tokens, const Split& s, int split) {
-  const Tensor all = child_tokens[size_t(split)]->forward(tokens).view({tokens.size(0) * 8, -1});
-  return all.index_select(0, s.parent * 8 + s.slot);
+  const Tensor all = child_tokens[size_t(split)]->forward(tokens.slice(1, 0, -3)).view({tokens.size(0) * 8, -1});
+  return torch::cat({all.index_select(0, s.parent * 8 + s.slot),
+                     tokens.slice(1, -3).index_select(0, s.parent)}, 1);
 }
 
 GaussianTensors EncoderNet::gaussians(const Tensor& voxel_tokens, const Tensor& coords, float h) {
   const int64_t n = coords.size(0), per_axis = config.gaussians_per_axis;
   const int64_t m = per_axis * per_axis * per_axis;
-  Tensor x = voxel_tokens + gaussian_mlp->forward(voxel_tokens);
-  x = gaussian_out->forward(gaussian_norm->forward(x)).view({n, m, 14});
+  Tensor x = voxel_tokens.slice(1, 0, -3);
+  x = gaussian_out->forward(gaussian_norm->forward(x + gaussian_mlp->forward(x))).view({n, m, 14});
+  const Tensor colour = x.slice(2, 11, 14) + voxel_tokens.slice(1, -3).unsqueeze(1);
   // Sub-lattice of the voxel, x slowest; offsets reach .75 voxel (spec E11).
   const Tensor axis = (torch::arange(per_axis, torch::kFloat32) + .5f) / float(per_axis);
   const auto grid = torch::meshgrid({axis, axis, axis}, "ij");
@@ -252,7 +286,7 @@ GaussianTensors EncoderNet::gaussians(const Tensor& voxel_tokens, const Tensor& 
   g.log_scale = torch::log(torch::softplus(x.slice(2, 3, 6) + raw0).clamp(.02, 1.5) * h).view({n * m, 3});
   g.rotation = (x.slice(2, 6, 10) + torch::tensor({1.f, 0.f, 0.f, 0.f})).view({n * m, 4});
   g.opacity_logit = (x.slice(2, 10, 11) + 1).view({n * m});
-  g.sh = (x.slice(2, 11, 14) * float(.5 / kSh0)).view({n * m, 1, 3});
+  g.sh = (srgbFromOpponent(colour) / kSh0).view({n * m, 1, 3});
   return g;
 }
 

@@ -68,7 +68,9 @@ struct EncoderNet : torch::nn::Module {
   /// GroupNorm over each token's channel groups (E10); the completer's outputs pass through it too.
   Tensor normalise(const Tensor& z);
 
-  /// Tokens of the decoder's transformer, [N, C].
+  /// Tokens of the decoder's transformer and, as the last 3 channels, the colour that all of a token's
+  /// Gaussians start from (opponent colours): [N, C + 3]. So are the tokens of childLogits, splitTokens and
+  /// gaussians.
   Tensor decodeTokens(const Tensor& z, const Tensor& coords, const Tensor& order);
   /// BCE-up logits of the 8 children, [N, 8], at the first (coarsest) split.
   Tensor childLogits(const Tensor& tokens, int split);
@@ -82,6 +84,9 @@ struct EncoderNet : torch::nn::Module {
   std::vector<std::shared_ptr<Mlp>> aggregate;
   torch::nn::Linear position_in{nullptr}, patch_in{nullptr}, geometry_in{nullptr}, posterior{nullptr},
       latent_in{nullptr}, gaussian_out{nullptr};
+  // Shallow ways around the transformers, for the mean colour of a token: learned in minutes, where the
+  // deep way stayed grey for an hour.
+  torch::nn::Linear feature_shortcut{nullptr}, colour_shortcut{nullptr};
   torch::nn::LayerNorm posterior_norm{nullptr}, decoder_norm{nullptr}, gaussian_norm{nullptr};
   torch::nn::GroupNorm latent_norm{nullptr};
   std::vector<std::shared_ptr<BidirectionalBlock>> blocks;

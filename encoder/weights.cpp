@@ -12,6 +12,7 @@ namespace {
 
 using nlohmann::json;
 constexpr uint64_t kMaxHeader = 64u << 20;
+constexpr int64_t kMaxCount = int64_t(1) << 40;  // values of a tensor
 
 const char* typeName(torch::ScalarType type) {
   switch (type) {
@@ -97,8 +98,8 @@ TensorFile readTensors(const std::string& path) {
       const auto offsets = entry.at("data_offsets").get<std::vector<uint64_t>>();
       uint64_t count = 1;
       for (int64_t d : shape) {
-        require(d >= 0 && (d == 0 || count <= (uint64_t(1) << 40) / uint64_t(d)), "readTensors: ", path,
-                ": ", name, " has an impossible shape");
+        require(d >= 0 && d <= kMaxCount && (d == 0 || int64_t(count) <= kMaxCount / d),
+                "readTensors: ", path, ": ", name, " has an impossible shape");
         count *= uint64_t(d);
       }
       const uint64_t bytes = count * torch::elementSize(type);

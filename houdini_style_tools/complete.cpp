@@ -1,10 +1,10 @@
 #include "houdini_style_tools/complete.h"
 
-#include <unistd.h>
-
 #include <algorithm>
 #include <cmath>
+#include <cstdio>
 #include <filesystem>
+#include <iterator>
 
 #include "splat/rasterize.h"
 
@@ -130,24 +130,34 @@ Image contactSheet(const std::vector<View>& views, const Completion& completion,
   return sheet;
 }
 
-std::string outputStem(const std::string& path) {
-  const fs::path p(path);
-  if (p.extension() != ".vdb" || p.stem().empty())
-    throw UsageError(joinText("--output: ", path, ": expected a name that ends in .vdb"));
-  const fs::path folder = p.has_parent_path() ? p.parent_path() : fs::path(".");
+namespace {
+constexpr const char* kEndings[] = {".points.vdb", ".ply", ".png", ".vdb"};
+}  // namespace
+
+void requireCreatable(const std::string& path) {
+  const fs::path folder = fs::path(path).has_parent_path() ? fs::path(path).parent_path() : fs::path(".");
   if (!fs::exists(folder)) {
     std::error_code error;
     fs::create_directories(folder, error);
     require(!error, "--output: ", folder.string(), ": cannot create the folder: ", error.message());
   }
   require(fs::is_directory(folder), "--output: ", folder.string(), ": expected a folder");
+  require(!fs::is_directory(path), "--output: ", path, ": is a folder (expected a file, or nothing)");
   // Asking the file system beats access(): root may pass access() on a read-only mount.
-  const std::string probe = (folder / (p.stem().string() + ".probe.tmp")).string();
+  const std::string probe = path + ".probe.tmp";
   std::FILE* f = std::fopen(probe.c_str(), "wb");
   require(f != nullptr, "--output: ", folder.string(), ": the folder is not writable");
   std::fclose(f);
   std::remove(probe.c_str());
-  return (folder / p.stem()).string();
+}
+
+std::string outputStem(const std::string& path) {
+  const fs::path p(path);
+  if (p.extension() != ".vdb" || p.stem().empty())
+    throw UsageError(joinText("--output: ", path, ": expected a name that ends in .vdb"));
+  const std::string stem = (p.has_parent_path() ? p.parent_path() / p.stem() : p.stem()).string();
+  for (const char* ending : kEndings) requireCreatable(stem + ending);
+  return stem;
 }
 
 void writeCompletion(const std::vector<View>& views, const Completion& c, const std::string& stem,
@@ -156,21 +166,23 @@ void writeCompletion(const std::vector<View>& views, const Completion& c, const 
   const SceneVoxels voxels = sceneVoxels(c.whole_decoded, c.whole, c.observation.space);
   const Gaussians& g = c.whole_decoded.gaussians;
   const int64_t per_voxel = voxels.ijk.empty() ? 0 : g.size() / int64_t(voxels.ijk.size());
-  const std::vector<std::string> endings = {".points.vdb", ".ply", ".png", ".vdb"};
   // Everything under other names first: all four files appear, or none.
   const std::string draft = stem + ".draft";
+  size_t placed = 0;
   try {
-    writePointsVdb(g, gaussianProvenance(voxels, per_voxel), draft + endings[0]);
+    writePointsVdb(g, gaussianProvenance(voxels, per_voxel), draft + kEndings[0]);
     report(progress, 30);
-    writePly(g, draft + endings[1], up.cast<float>());
+    writePly(g, draft + kEndings[1], up.cast<float>());
     report(progress, 50);
-    writePng(contactSheet(views, c, up), draft + endings[2]);
+    writePng(contactSheet(views, c, up), draft + kEndings[2]);
     report(progress, 70);
-    writeSceneVdb(voxels, draft + endings[3]);
-    for (const std::string& ending : endings) fs::rename(draft + ending, stem + ending);
+    writeSceneVdb(voxels, draft + kEndings[3]);
+    for (; placed < std::size(kEndings); ++placed)
+      fs::rename(draft + kEndings[placed], stem + kEndings[placed]);
   } catch (...) {
     std::error_code ignored;
-    for (const std::string& ending : endings) fs::remove(draft + ending, ignored);
+    for (const char* ending : kEndings) fs::remove(draft + ending, ignored);
+    for (size_t i = 0; i < placed; ++i) fs::remove(stem + kEndings[i], ignored);
     throw;
   }
   progress.end();

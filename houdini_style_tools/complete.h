@@ -39,6 +39,9 @@ Provenance gaussianProvenance(const SceneVoxels& voxels, int64_t gaussians_per_v
 Image contactSheet(const std::vector<View>& views, const Completion& completion,
                    const Eigen::Vector3d& up);
 
+/// Throws Error unless a file can be created at `path`; makes its folder. For before any long work.
+void requireCreatable(const std::string& path);
+
 /// Throws Error unless X.vdb can be created beside its siblings; called before any long work.
 /// Returns X of an output path X.vdb.
 std::string outputStem(const std::string& vdb_path);

@@ -17,6 +17,10 @@ Console::Console(bool json) : json_(json), terminal_(isatty(STDERR_FILENO) != 0)
   std::signal(SIGTERM, onSignal);
 }
 
+Console::~Console() {
+  if (terminal_ && !json_ && !stage_.empty()) std::fputc('\n', stderr);
+}
+
 void Console::start(const char* stage) {
   const std::lock_guard<std::mutex> lock(mutex_);
   stage_ = stage ? stage : "";

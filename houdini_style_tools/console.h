@@ -14,6 +14,8 @@ class Console : public Progress {
  public:
   /// Installs the signal handlers (once per process is enough).
   explicit Console(bool json);
+  /// Ends a line that an Error left unfinished.
+  ~Console() override;
   void start(const char* stage = nullptr) override;
   void end() override;
   bool wasInterrupted(int percent = -1) override;

@@ -1,5 +1,6 @@
 // vdb_complete: verbs, options and exit codes.
 #include <ATen/Parallel.h>
+#include <malloc.h>
 #include <tbb/global_control.h>
 
 #include <CLI/CLI.hpp>
@@ -31,7 +32,7 @@ struct Common {
 struct Complete {
   std::string views, frames, output, weights;
   std::vector<double> up, bounds;
-  double voxel = 0, margin = VolumeSettings().margin_m;
+  double margin = VolumeSettings().margin_m;
   double tau = CompleteSettings().tau, coarse_tau = CompleteSettings().coarse_tau;
   double temperature = 1;
   int sampling_steps = 0;
@@ -93,7 +94,8 @@ SceneSettings sceneSettings(const Complete& o, const Common& common, const Eigen
   if (!o.bounds.empty()) {
     s.volume.bounds = Eigen::AlignedBox3d(Eigen::Vector3d(o.bounds[0], o.bounds[1], o.bounds[2]),
                                           Eigen::Vector3d(o.bounds[3], o.bounds[4], o.bounds[5]));
-    if (s.volume.bounds->sizes().minCoeff() <= 0)
+    const Eigen::Vector3d sizes = s.volume.bounds->sizes();
+    if (!sizes.allFinite() || sizes.minCoeff() <= 0)
       throw UsageError("--bounds: expected a box: x0 y0 z0 x1 y1 z1 with each second corner larger");
   }
   s.completion.tau = float(o.tau), s.completion.coarse_tau = float(o.coarse_tau);
@@ -106,8 +108,18 @@ SceneSettings sceneSettings(const Complete& o, const Common& common, const Eigen
 Eigen::Vector3d upOf(const Complete& o) {
   if (o.up.empty()) return conventionalUp(o.views);
   const Eigen::Vector3d up(o.up[0], o.up[1], o.up[2]);
-  if (!(up.norm() > 1e-6)) throw UsageError("--up: expected a vector that is not zero");
+  if (!up.allFinite() || up.norm() < 1e-6) throw UsageError("--up: expected a finite vector that is not zero");
   return up.normalized();
+}
+
+// Code that only knows the views cannot say in an Error where they are from.
+template <typename Function>
+auto naming(const std::string& source, const Function& function) {
+  try {
+    return function();
+  } catch (const Error& e) {
+    throw Error(joinText(source, ": ", e.what()));
+  }
 }
 
 void cookComplete(const Complete& o, const Common& common, Progress& progress) {
@@ -118,12 +130,11 @@ void cookComplete(const Complete& o, const Common& common, Progress& progress) {
   progress.start("read");
   const std::vector<View> views = readViews(o.views, {frames, 0});
   const Eigen::Vector3d up = upOf(o);
-  SceneSettings settings = sceneSettings(o, common, up);
+  const SceneSettings settings = sceneSettings(o, common, up);
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
   progress.end();
-  settings.volume.voxel_m = o.voxel > 0 ? float(o.voxel) : encoder.config().voxel_m;
-  const Completion c = completeScene(views, encoder, completer, settings, progress);
+  const Completion c = naming(o.views, [&] { return completeScene(views, encoder, completer, settings, progress); });
   writeCompletion(views, c, stem, up, progress);
   const double seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   if (common.json) {
@@ -226,15 +237,21 @@ void cookEvaluate(const Evaluate& o, const Complete& options, const Common& comm
     }
     std::fflush(stdout);
   };
-  for (int64_t i = 0; i < scenes.count; ++i)
-    for (const MethodResult& r : evaluateScene(scenes.scene(i), encoder, completer, settings, progress)) {
+  for (int64_t i = 0; i < scenes.count; ++i) {
+    const EvaluationScene scene = scenes.scene(i);
+    for (const MethodResult& r :
+         naming(scene.name, [&] { return evaluateScene(scene, encoder, completer, settings, progress); })) {
       show(r);
       all.push_back(r);
     }
+  }
   for (const MethodResult& r : meanResults(all)) show(r);
 }
 
 TrainSettings trainSettings(const Train& t, const Common& common) {
+  if (fs::path(t.output).extension() != ".safetensors")
+    throw UsageError(joinText("--output: ", t.output, ": expected a name that ends in .safetensors"));
+  requireCreatable(t.output);
   TrainSettings s;
   s.weights_path = t.output;
   s.work_folder = t.work.empty() ? t.output + ".work" : t.work;
@@ -296,6 +313,17 @@ void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
                  trainListener(common.json), progress);
 }
 
+// CLI::Range lets NaN pass.
+struct Between : CLI::Range {
+  Between(double low, double high) : Range(low, high) {
+    func_ = [low, high](std::string& text) {
+      double value = 0;
+      if (CLI::detail::lexical_cast(text, value) && value >= low && value <= high) return std::string();
+      return joinText("expected ", low, " to ", high, ", found ", text);
+    };
+  }
+};
+
 void addCommon(CLI::App* app, Common* c) {
   app->add_option("--seed", c->seed, "fixes every random choice")->capture_default_str();
   app->add_option("--threads", c->threads, "worker threads, 0 = all cores")
@@ -304,11 +332,11 @@ void addCommon(CLI::App* app, Common* c) {
 }
 
 void addCompletion(CLI::App* app, Complete* o) {
-  app->add_option("--margin", o->margin, "room around what was seen [m]")->check(CLI::Range(0., 100.))->capture_default_str();
-  app->add_option("--tau", o->tau, "a token is kept above this probability")->check(CLI::Range(0., 1.))->capture_default_str();
-  app->add_option("--coarse-tau", o->coarse_tau, "the same for the coarse gate")->check(CLI::Range(0., 1.))->capture_default_str();
+  app->add_option("--margin", o->margin, "room around what was seen [m]")->check(Between(0, 100))->capture_default_str();
+  app->add_option("--tau", o->tau, "a token is kept above this probability")->check(Between(0, 1))->capture_default_str();
+  app->add_option("--coarse-tau", o->coarse_tau, "the same for the coarse gate")->check(Between(0, 1))->capture_default_str();
   app->add_option("--sampling-steps", o->sampling_steps, "diffusion steps, 0 = the linear mean")->check(CLI::Range(0, 1000))->capture_default_str();
-  app->add_option("--temperature", o->temperature, "of the diffusion head")->check(CLI::Range(0., 10.))->capture_default_str();
+  app->add_option("--temperature", o->temperature, "of the diffusion head")->check(Between(0, 10))->capture_default_str();
   app->add_flag("--refine-observed", o->refine_observed, "let the completer rewrite observed latents");
 }
 
@@ -319,7 +347,7 @@ void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rat
   auto* s = verb->add_option("--steps", t->steps, joinText("training steps [", steps, "]"))->check(CLI::Range(int64_t(1), int64_t(1) << 40));
   auto* n = verb->add_option("--rooms", t->scenes, joinText("procedural rooms to train on [", rooms, "]"))
                 ->check(CLI::Range(int64_t(1), int64_t(kReservedSeeds)));
-  auto* r = verb->add_option("--rate", t->rate, joinText("peak learning rate [", rate, "]"))->check(CLI::Range(0., 1.));
+  auto* r = verb->add_option("--rate", t->rate, joinText("peak learning rate [", rate, "]"))->check(Between(0, 1));
   verb->add_flag("--resume", t->resume, "continue from the checkpoint in the work folder");
   verb->callback([=] {
     if (!s->count()) t->steps = steps;
@@ -348,7 +376,6 @@ int run(int argc, char** argv) {
   app.add_option("--weights", complete.weights, "folder with encoder.safetensors and completer.safetensors");
   app.add_option("--up", complete.up, "x y z that points up in the world [the format's]")->expected(3);
   app.add_option("--bounds", complete.bounds, "x0 y0 z0 x1 y1 z1 to complete [seen and margin]")->expected(6);
-  app.add_option("--voxel", complete.voxel, "voxel edge [the weights']")->check(CLI::Range(.001, 100.));
   addCompletion(&app, &complete);
 
   CLI::App* info = app.add_subcommand("info", "BLAS, threads, speed and weights");
@@ -379,7 +406,8 @@ int run(int argc, char** argv) {
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& e) {
-    return app.exit(e) == 0 ? 0 : 2;
+    if (e.get_exit_code() == 0) return app.exit(e);  // --help, --version
+    throw UsageError(joinText(e.what(), " (vdb_complete --help)"));
   }
   const int threads = common.threads ? common.threads : int(std::max(1u, std::thread::hardware_concurrency()));
   const tbb::global_control limit(tbb::global_control::max_allowed_parallelism, size_t(threads));
@@ -410,10 +438,15 @@ int run(int argc, char** argv) {
 
 int main(int argc, char** argv) {
   vdbc::chooseBlasCore();
+  // Tensors of some megabytes come and go: keep their pages instead of asking the kernel each time.
+  mallopt(M_MMAP_THRESHOLD, 1 << 30);
+  mallopt(M_TRIM_THRESHOLD, 1 << 30);
   try {
-    return vdbc::run(argc, argv);
+    const int code = vdbc::run(argc, argv);
+    vdbc::require(std::fflush(stdout) == 0, "standard output: cannot write the results");
+    return code;
   } catch (const vdbc::Cancelled&) {
-    std::fprintf(stderr, "\nvdb_complete: interrupted\n");
+    std::fprintf(stderr, "vdb_complete: interrupted\n");
     return 130;
   } catch (const vdbc::UsageError& e) {
     std::fprintf(stderr, "vdb_complete: %s\n", e.what());

@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <map>
 #include <nlohmann/json.hpp>
-#include <unordered_map>
+#include <set>
 
 #include "encoder/weights.h"
 #include "mar/network.h"
@@ -227,8 +227,6 @@ struct Completer::Impl {
   // Rows of `seen` first, exactly as they were unless refined.
   LatentGrid result(const Growth& g, const LatentGrid& seen, bool refined) const {
     LatentGrid out = seen;
-    // The encoder's latents are normalised per group; predictions are projected back the same way by
-    // the caller's decoder, which takes them as they are.
     const Tensor z = net->restore(g.z).contiguous();
     const int64_t first = refined ? 0 : g.seeds;
     out.z.resize(size_t(first) * size_t(out.dim));
@@ -284,7 +282,7 @@ LatentGrid Completer::completeAt(const LatentGrid& seen, const ObservedSpace& sp
   const SceneTokens scene = sceneTokens(poolStates(seen.frame, space, 1), poolStates(seen.frame, space, 2));
   std::map<Coord, float> gate;
   std::vector<Coord> candidates;
-  for (const Coord& c : occupied) {
+  for (const Coord& c : std::set<Coord>(occupied.begin(), occupied.end())) {
     if (scene.nodes.at(c) != NodeState::kUnobserved) continue;
     candidates.push_back(c);
     gate[tokenCoord(c, 1)] = 1;

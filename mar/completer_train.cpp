@@ -8,6 +8,7 @@
 
 #include "encoder/trainer.h"
 #include "mar/network.h"
+#include "mar/training_masks.h"
 
 namespace vdbc {
 namespace {
@@ -29,80 +30,25 @@ std::vector<Coord> selectRandom(const std::vector<Coord>& from, double share, to
   return chosen;
 }
 
-// Truth and weight of positions: F 1, E 0, U 0 with the configured low weight (training.md, spec A1).
-struct Labels {
-  Tensor truth, weight;  // [N]
-};
-Labels labelsOf(const std::vector<Coord>& positions, const NodeStates& truth, float unobserved_weight) {
-  const int64_t n = int64_t(positions.size());
-  Labels l{torch::zeros({n}), torch::ones({n})};
-  for (int64_t i = 0; i < n; ++i) {
-    const NodeState s = truth.at(positions[size_t(i)]);
-    l.truth.data_ptr<float>()[i] = s == NodeState::kFilled;
-    if (s == NodeState::kUnobserved) l.weight.data_ptr<float>()[i] = unobserved_weight;
-  }
-  return l;
-}
+}  // namespace
 
-Tensor occupancyLoss(const Tensor& logits, const Labels& l, const CompleterConfig& c) {
-  // Positions of weight 0 leave the graph: whatever stands there cannot reach loss or gradients.
-  const Tensor rows = l.weight.nonzero().flatten();
-  if (rows.size(0) == 0) return logits.sum() * 0;
-  return 2 * focalLoss(logits.index_select(0, rows), l.truth.index_select(0, rows),
-                       l.weight.index_select(0, rows), c.focal_gamma, c.focal_alpha);
-}
-
-struct Losses {
-  Tensor coarse, fine, linear, diffusion, refinement;
-  Tensor total() const { return coarse + fine + linear + .5f * diffusion + .25f * refinement; }
-};
-
-// Target latents by position.
-struct TargetRows {
-  std::unordered_map<uint64_t, int64_t> row;
-  static uint64_t key(const Coord& c) {
-    return uint64_t(uint32_t(c.x() + (1 << 20))) << 42 | uint64_t(uint32_t(c.y() + (1 << 20))) << 21 |
-           uint64_t(uint32_t(c.z() + (1 << 20)));
-  }
-  explicit TargetRows(const std::vector<Coord>& coords) {
-    for (size_t i = 0; i < coords.size(); ++i) row[key(coords[i])] = int64_t(i);
-  }
-  int64_t find(const Coord& c) const {
-    const auto found = row.find(key(c));
-    return found == row.end() ? -1 : found->second;
-  }
-};
-
-// The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities there.
-Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s,
-                  torch::Generator& random, std::map<Coord, float>* gate) {
-  for (const Coord& c : scene.coarse_filled) (*gate)[c] = 1;
-  std::vector<Coord> worked_on = selectRandom(scene.coarse_unknown, uniform(.3, 1, random), random);
+CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const NodeStates& truth,
+                          torch::Generator& random) {
+  CoarseMask m;
+  const std::vector<Coord> worked_on = selectRandom(unknown, uniform(.3, 1, random), random);
   // Inference is one shot from the condition tokens; half of the samples train just that.
-  std::vector<Coord> visible, targets;
   const double hidden = uniform(random) < .5 ? 1.0 : uniform(.5, 1, random);
   const Tensor draws = torch::rand({int64_t(worked_on.size())}, random);
   for (size_t i = 0; i < worked_on.size(); ++i) {
-    const bool shown = s.target_coarse.at(worked_on[i]) == NodeState::kFilled &&
-                       draws.data_ptr<float>()[i] >= hidden;
-    (shown ? visible : targets).push_back(worked_on[i]);
+    const bool shown = truth.at(worked_on[i]) == NodeState::kFilled && draws.data_ptr<float>()[i] >= hidden;
+    (shown ? m.visible : m.targets).push_back(worked_on[i]);
   }
-  for (const Coord& c : visible) (*gate)[c] = 1;
-  if (targets.empty()) return torch::zeros({});
-  const Tensor logits = net.coarseLogits(
-      coarseInputs(scene, visible, targets, net.config.coarse_empty_tokens), s.condition.frame);
-  const Tensor p = logits.detach().sigmoid().contiguous();
-  for (size_t i = 0; i < targets.size(); ++i) (*gate)[targets[i]] = p.data_ptr<float>()[i];
-  return occupancyLoss(logits, labelsOf(targets, s.target_coarse, net.config.unobserved_weight),
-                       net.config);
+  return m;
 }
 
-// Which tokens a roll-out might have made when it comes to its next level.
-struct Mask {
-  std::vector<Coord> visible, false_visible, frontier, others;
-};
-Mask drawMask(const std::vector<Coord>& candidates, const CompletionSample& s, torch::Generator& random) {
-  Mask m;
+FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& s,
+                      torch::Generator& random) {
+  FineMask m;
   const bool growth = uniform(random) < .5;
   const int32_t depth = int32_t(torch::randint(6, {1}, random).item<int64_t>());
   const std::vector<int32_t> levels = breadthFirstLevels(candidates, s.condition.ijk);
@@ -137,6 +83,73 @@ Mask drawMask(const std::vector<Coord>& candidates, const CompletionSample& s, t
   return m;
 }
 
+namespace {
+
+// Truth and weight of positions: F 1, E 0, U 0 with the configured low weight (training.md, spec A1).
+struct Labels {
+  Tensor truth, weight;  // [N]
+};
+Labels labelsOf(const std::vector<Coord>& positions, const NodeStates& truth, float unobserved_weight) {
+  const int64_t n = int64_t(positions.size());
+  Labels l{torch::zeros({n}), torch::ones({n})};
+  for (int64_t i = 0; i < n; ++i) {
+    const NodeState s = truth.at(positions[size_t(i)]);
+    l.truth.data_ptr<float>()[i] = s == NodeState::kFilled;
+    if (s == NodeState::kUnobserved) l.weight.data_ptr<float>()[i] = unobserved_weight;
+  }
+  return l;
+}
+
+Tensor occupancyLoss(const Tensor& logits, const Labels& l, const CompleterConfig& c) {
+  // Positions of weight 0 leave the graph: whatever stands there cannot reach loss or gradients.
+  const Tensor rows = l.weight.nonzero().flatten();
+  if (rows.size(0) == 0) return logits.sum() * 0;
+  return 2 * focalLoss(logits.index_select(0, rows), l.truth.index_select(0, rows),
+                       l.weight.index_select(0, rows), c.focal_gamma, c.focal_alpha);
+}
+
+struct Losses {
+  Tensor coarse, fine, linear, diffusion, refinement;
+  Tensor total() const { return coarse + fine + linear + .5f * diffusion + .25f * refinement; }
+};
+
+// Target latents by position, where the dense views saw a surface: what else a file holds is no truth
+// (spec A1).
+struct TargetRows {
+  std::unordered_map<uint64_t, int64_t> row;
+  std::vector<int64_t> all;
+  static uint64_t key(const Coord& c) {
+    return uint64_t(uint32_t(c.x() + (1 << 20))) << 42 | uint64_t(uint32_t(c.y() + (1 << 20))) << 21 |
+           uint64_t(uint32_t(c.z() + (1 << 20)));
+  }
+  explicit TargetRows(const CompletionSample& s) {
+    for (size_t i = 0; i < s.target.ijk.size(); ++i) {
+      if (s.target_nodes.at(s.target.ijk[i]) != NodeState::kFilled) continue;
+      row[key(s.target.ijk[i])] = int64_t(i);
+      all.push_back(int64_t(i));
+    }
+  }
+  int64_t find(const Coord& c) const {
+    const auto found = row.find(key(c));
+    return found == row.end() ? -1 : found->second;
+  }
+};
+
+// The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities there.
+Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s,
+                  torch::Generator& random, std::map<Coord, float>* gate) {
+  for (const Coord& c : scene.coarse_filled) (*gate)[c] = 1;
+  const auto [visible, targets] = drawCoarseMask(scene.coarse_unknown, s.target_coarse, random);
+  for (const Coord& c : visible) (*gate)[c] = 1;
+  if (targets.empty()) return torch::zeros({});
+  const Tensor logits = net.coarseLogits(
+      coarseInputs(scene, visible, targets, net.config.coarse_empty_tokens), s.condition.frame);
+  const Tensor p = logits.detach().sigmoid().contiguous();
+  for (size_t i = 0; i < targets.size(); ++i) (*gate)[targets[i]] = p.data_ptr<float>()[i];
+  return occupancyLoss(logits, labelsOf(targets, s.target_coarse, net.config.unobserved_weight),
+                       net.config);
+}
+
 std::vector<Coord> nearestOf(const std::vector<Coord>& from, const Eigen::Vector3d& centre, int64_t n) {
   std::vector<Coord> chosen;
   for (int64_t row : nearestRows(from, centre, n)) chosen.push_back(from[size_t(row)]);
@@ -157,8 +170,9 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generat
   for (const auto& [node, probability] : gate)
     if (probability > tau || s.target_coarse.at(node) == NodeState::kFilled) open.push_back(node);
   const std::vector<Coord> candidates = unobservedChildren(open, scene.nodes);
-  if (candidates.empty()) return l;
-  Mask m = drawMask(candidates, s, random);
+  const TargetRows rows(s);
+  if (candidates.empty() || rows.all.empty()) return l;
+  const FineMask m = drawFineMask(candidates, s, random);
   const std::vector<Coord>& around = m.frontier.empty() ? m.others : m.frontier;
   if (around.empty()) return l;
 
@@ -170,7 +184,9 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generat
     targets.push_back(t);
 
   // Context: nearest of condition, visible and wrong tokens together, as inference takes them.
-  const TargetRows rows(s.target.ijk);
+  auto anyRow = [&] {
+    return rows.all[size_t(torch::randint(int64_t(rows.all.size()), {1}, random).item<int64_t>())];
+  };
   std::vector<Coord> context = s.condition.ijk;
   context.insert(context.end(), m.visible.begin(), m.visible.end());
   context.insert(context.end(), m.false_visible.begin(), m.false_visible.end());
@@ -185,7 +201,7 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generat
       in[kVisible].coords.push_back(token);
       // A wrong token carries some true token's latent: plausible content in a wrong place.
       const int64_t own = rows.find(token);
-      visible_rows.push_back(own >= 0 ? own : torch::randint(s.target.size(), {1}, random).item<int64_t>());
+      visible_rows.push_back(own >= 0 ? own : anyRow());
     }
   }
   const Tensor condition_z = net.standardise(torch::tensor(s.condition.z).view({s.condition.size(), -1}));
@@ -248,7 +264,7 @@ std::map<std::string, double> validate(const std::string& weights, const std::ve
     for (auto node = s.seen_nodes.box.begin(); node; ++node)
       truth += s.seen_nodes.at(*node) == NodeState::kUnobserved &&
                s.target_nodes.at(*node) == NodeState::kFilled;
-    const TargetRows rows(s.target.ijk);
+    const TargetRows rows(s);
     for (int64_t k = s.condition.size(); k < whole.size(); ++k) {
       const NodeState state = s.target_nodes.at(whole.ijk[size_t(k)]);
       filled += 1, known += state != NodeState::kUnobserved, hit += state == NodeState::kFilled;

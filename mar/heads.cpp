@@ -93,6 +93,9 @@ DiffusionHead::Loss DiffusionHead::loss(const Tensor& h, const Tensor& target, i
   return l;
 }
 
+// Residuals around the mean are of latents of unit deviation (standardise()).
+constexpr double kLargest = 4;
+
 Tensor DiffusionHead::sample(const Tensor& h, int sampling_steps, double temperature,
                              torch::Generator& random) {
   const Tensor centre = mean(h);
@@ -103,8 +106,10 @@ Tensor DiffusionHead::sample(const Tensor& h, int sampling_steps, double tempera
     const int now = (steps - 1) - int(int64_t(steps - 1) * i / sampling_steps);
     const int next = (steps - 1) - int(int64_t(steps - 1) * (i + 1) / sampling_steps);
     const double bar = bars[now], bar_next = i + 1 == sampling_steps ? 1.0 : double(bars[next]);
-    const Tensor epsilon = noise(x, torch::full({x.size(0)}, now, torch::kInt64), h);
-    const Tensor x0 = (x - std::sqrt(1 - bar) * epsilon) / std::sqrt(bar);
+    const Tensor predicted = noise(x, torch::full({x.size(0)}, now, torch::kInt64), h);
+    // The first steps divide by .01: an error of the noise becomes 100 of x0. No latent lies there.
+    const Tensor x0 = ((x - std::sqrt(1 - bar) * predicted) / std::sqrt(bar)).clamp(-kLargest, kLargest);
+    const Tensor epsilon = (x - std::sqrt(bar) * x0) / std::sqrt(1 - bar);
     x = std::sqrt(bar_next) * x0 + std::sqrt(1 - bar_next) * epsilon;
   }
   return centre + x;

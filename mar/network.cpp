@@ -32,7 +32,7 @@ MaskedTransformer::Output MaskedTransformer::forward(const std::array<TokenSet, 
     const int64_t n = int64_t(inputs[k].coords.size());
     coords[k] = coordTensor(inputs[k].coords);
     const Tensor features = sizes.feature_dims[k] ? inputs[k].features : torch::ones({n, 1});
-    tokens[k] = embed_norm[k]->forward(embed[k]->forward(features.view({n, -1})));
+    tokens[k] = embed_norm[k]->forward(embed[k]->forward(features.view({n, std::max(1, sizes.feature_dims[k])})));
     if (position_code)
       tokens[k] = tokens[k] +
                   position_in->forward(sinusoidalCode(tokenPositions(coords[k], level, frame)));

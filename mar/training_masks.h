@@ -1,0 +1,30 @@
+#pragma once
+// Private: what a training step hides from the completer (paper sec. 4, spec A2).
+#include "encoder/layers.h"
+#include "mar/completer_train.h"
+
+namespace vdbc {
+
+/// A random share (.3-1) of the unknown coarse nodes, split into what is shown and what is asked.
+struct CoarseMask {
+  std::vector<Coord> visible;  // filled in truth
+  std::vector<Coord> targets;  // the rest, whatever it is; the loss is on these
+};
+/// Half of the masks hide everything, which is what inference asks; half a random .5-1 of the truth.
+CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const NodeStates& truth,
+                          torch::Generator& random);
+
+/// Which tokens a roll-out might have made when it comes to its next level: a partition of the
+/// candidates.
+struct FineMask {
+  std::vector<Coord> visible;        // filled in truth
+  std::vector<Coord> false_visible;  // not filled, yet taken for it: up to 6 %
+  std::vector<Coord> frontier;       // asked next: one step from what is visible
+  std::vector<Coord> others;         // hidden, or visited and rejected
+};
+/// Half of the masks are growth states (BFS depth 0-5 from the condition tokens), half hide a random
+/// .5-1 of the truth.
+FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& sample,
+                      torch::Generator& random);
+
+}  // namespace vdbc

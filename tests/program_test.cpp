@@ -1,0 +1,663 @@
+// The program as its users meet it: exit codes, error lines, what is left behind, what is written.
+#include <fcntl.h>
+#include <gtest/gtest.h>
+#include <spawn.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <csignal>
+#include <cstdlib>
+#include <filesystem>
+#include <fstream>
+#include <limits>
+#include <map>
+#include <nlohmann/json.hpp>
+#include <set>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "examples/rooms/rooms.h"
+#include "splat/gaussian_io.h"
+#include "splat/rasterize.h"
+#include "splat/view.h"
+#include "vdb/error.h"
+#include "vdb/scene_volume.h"
+
+#ifndef VDBC_WEIGHTS
+#define VDBC_WEIGHTS VDBC_SOURCE_DIR "/weights/small"
+#endif
+
+extern char** environ;
+
+namespace vdbc {
+namespace {
+
+namespace fs = std::filesystem;
+using nlohmann::json;
+using Args = std::vector<std::string>;
+
+constexpr int kOk = 0, kFailed = 1, kUsage = 2, kInterrupted = 130;
+const Args kSiblings = {"x.ply", "x.png", "x.points.vdb", "x.vdb"};  // sorted
+
+std::string readText(const std::string& path) {
+  std::ifstream in(path, std::ios::binary);
+  return {std::istreambuf_iterator<char>(in), std::istreambuf_iterator<char>()};
+}
+
+void writeText(const std::string& path, const std::string& text) {
+  std::ofstream(path, std::ios::binary) << text;
+}
+
+std::vector<std::string> lines(const std::string& text) {
+  std::vector<std::string> result;
+  std::stringstream in(text);
+  for (std::string line; std::getline(in, line);) result.push_back(line);
+  return result;
+}
+
+// Everything below a folder, sorted.
+Args listing(const std::string& folder) {
+  Args names;
+  for (const auto& entry : fs::recursive_directory_iterator(folder))
+    names.push_back(fs::relative(entry.path(), folder).string());
+  std::sort(names.begin(), names.end());
+  return names;
+}
+
+// How a run ended: its exit code, or 128 + the signal that killed it, as a shell says.
+struct Ended {
+  int code = -1;
+  std::string out, err;
+};
+
+// A scratch folder with small inputs, and the program to run on them.
+class Program : public ::testing::Test {
+ protected:
+  void SetUp() override {
+    std::string name = (fs::temp_directory_path() / "vdbc_program_XXXXXX").string();
+    ASSERT_NE(mkdtemp(name.data()), nullptr);
+    root_ = name;
+    output_ = root_ + "/out";
+    fs::create_directory(output_);
+  }
+  void TearDown() override {
+    std::error_code ignored;
+    fs::remove_all(root_, ignored);
+  }
+
+  std::string at(const std::string& name) const { return root_ + "/" + name; }
+
+  // Starts the program; with `signal_at`, sends SIGINT once that stage has begun (needs --json).
+  Ended run(const Args& args, const std::string& signal_at = "") const {
+    const std::string out = at("stdout.txt"), err = at("stderr.txt");
+    posix_spawn_file_actions_t actions;
+    posix_spawn_file_actions_init(&actions);
+    const int flags = O_WRONLY | O_CREAT | O_TRUNC;
+    posix_spawn_file_actions_addopen(&actions, 0, "/dev/null", O_RDONLY, 0);
+    posix_spawn_file_actions_addopen(&actions, 1, out.c_str(), flags, 0600);
+    posix_spawn_file_actions_addopen(&actions, 2, err.c_str(), flags, 0600);
+    std::vector<char*> argv = {const_cast<char*>(VDBC_PROGRAM)};
+    for (const std::string& a : args) argv.push_back(const_cast<char*>(a.c_str()));
+    argv.push_back(nullptr);
+    // Tests run side by side: more threads than cores would only wait for each other.
+    setenv("VDB_COMPLETE_THREADS", "1", 1);
+    writeText(err, "");
+    pid_t pid = 0;
+    const int failure = posix_spawn(&pid, VDBC_PROGRAM, &actions, nullptr, argv.data(), environ);
+    posix_spawn_file_actions_destroy(&actions);
+    Ended ended;
+    EXPECT_EQ(failure, 0) << "cannot start " << VDBC_PROGRAM;
+    if (failure) return ended;
+    int status = 0;
+    if (!signal_at.empty()) {
+      const std::string begun = "{\"stage\": \"" + signal_at + "\"";
+      while (waitpid(pid, &status, WNOHANG) == 0) {
+        if (readText(err).find(begun) != std::string::npos) {
+          kill(pid, SIGINT);
+          break;
+        }
+        std::this_thread::sleep_for(std::chrono::milliseconds(1));
+      }
+    }
+    waitpid(pid, &status, 0);
+    ended.code = WIFEXITED(status) ? WEXITSTATUS(status) : 128 + WTERMSIG(status);
+    ended.out = readText(out), ended.err = readText(err);
+    return ended;
+  }
+
+  // A failure: this exit code, nothing on stdout, one line on stderr that says `named`, and the
+  // output folder as it was.
+  void expectFailure(const Args& args, int code, const std::string& named) const {
+    std::string command;
+    for (const std::string& a : args) command += " " + a;
+    SCOPED_TRACE("vdb_complete" + command);
+    const Args before = listing(output_);
+    const Ended ended = run(args);
+    EXPECT_EQ(ended.code, code);
+    EXPECT_EQ(ended.out, "");
+    EXPECT_EQ(std::count(ended.err.begin(), ended.err.end(), '\n'), 1) << ended.err;
+    EXPECT_EQ(ended.err.rfind("vdb_complete: ", 0), 0u) << ended.err;
+    EXPECT_NE(ended.err.find(named), std::string::npos)
+        << ended.err << "expected to name: " << named;
+    EXPECT_EQ(listing(output_), before);
+  }
+
+  Args complete(const std::string& views, const Args& more = {}) const {
+    Args args = {views, "-o", output_ + "/x.vdb", "--weights", VDBC_WEIGHTS};
+    args.insert(args.end(), more.begin(), more.end());
+    return args;
+  }
+
+  // Bad views: the message names `named`, or else the views.
+  void expectBadViews(const std::string& views, const std::string& named = "",
+                      const Args& more = {}) const {
+    expectFailure(complete(views, more), kFailed, named.empty() ? views : named);
+  }
+
+  // Views of a procedural room, small enough to complete in a second.
+  static std::vector<View> roomViews(int count) {
+    const Room room = makeRoom(7);
+    const RoomRenderer renderer(room);
+    std::mt19937_64 random(7);
+    std::vector<View> views;
+    for (const Camera& camera : randomCameras(room, count, 64, 48, random)) {
+      views.push_back(renderer.render(camera, 1, views.size()));
+      views.back().name = std::to_string(views.size() - 1);
+    }
+    return views;
+  }
+
+  std::string writeRoom(const std::string& name, int count = 2) const {
+    writeViews(roomViews(count), at(name));
+    return at(name);
+  }
+
+  // A box of 1.6 m around what the first view looks at: completed in half a second.
+  static Args smallBox() {
+    const View view = roomViews(1)[0];
+    const Camera& c = view.camera;
+    const int x = c.width / 2, y = c.height / 2;
+    const Eigen::Vector3d centre = c.unproject(x + .5, y + .5, view.depth[size_t(y * c.width + x)]);
+    Args args = {"--bounds"};
+    for (double side : {-.8, .8})
+      for (int axis = 0; axis < 3; ++axis) args.push_back(std::to_string(centre[axis] + side));
+    return args;
+  }
+
+  // Every voxel of a small box, for files to damage.
+  std::string writeVolume() const {
+    SceneVoxels v;
+    v.frame.bounds = CoordBBox(Coord(0), Coord(7));
+    for (auto i = CoordBBox(Coord(0), Coord(3)).begin(); i; ++i) {
+      v.ijk.push_back(*i);
+      v.colour_linear.emplace_back(.2f, .4f, .6f);
+      v.density.push_back(1), v.observed.push_back(1), v.probability.push_back(1),
+          v.bfs_level.push_back(0);
+    }
+    writeSceneVdb(v, at("volume.vdb"));
+    return at("volume.vdb");
+  }
+
+  std::string writeSplats() const {
+    Gaussians g;
+    g.resize(50, 0);
+    for (size_t i = 0; i < 50; ++i) {
+      g.mean[i] = Eigen::Vector3f(float(i % 7), float(i % 5), float(i % 3));
+      g.log_scale[i] = Eigen::Vector3f::Constant(-2);
+      g.rotation[i] = Eigen::Vector4f(1, 0, 0, 0);
+      g.opacity_logit[i] = 2;
+    }
+    writePly(g, at("splats.ply"));
+    return at("splats.ply");
+  }
+
+  std::string root_, output_;
+};
+
+bool haveWeights() {
+  return fs::exists(VDBC_WEIGHTS "/encoder.safetensors") &&
+         fs::exists(VDBC_WEIGHTS "/completer.safetensors");
+}
+#define NEEDS_WEIGHTS() \
+  if (!haveWeights()) GTEST_SKIP() << "no trained weights in " << VDBC_WEIGHTS
+
+// ---- the command line
+
+TEST_F(Program, UsageErrorsExitWith2) {
+  const std::string views = writeRoom("views"), x = output_ + "/x.vdb";
+  expectFailure({}, kUsage, "VIEWS");
+  expectFailure({"--frobnicate"}, kUsage, "--frobnicate");
+  expectFailure({views, "frobnicate", "-o", x}, kUsage, "frobnicate");
+  expectFailure({views}, kUsage, "-o");
+  expectFailure({"train"}, kUsage, "subcommand");
+  expectFailure({"render", at("a.ply"), "-o", output_}, kUsage, "--cameras");
+  expectFailure({"render", at("a.xyz"), "--cameras", views, "-o", output_}, kUsage, at("a.xyz"));
+  expectFailure(complete(views, {"--seed", "one"}), kUsage, "--seed");
+  expectFailure(complete(views, {"--threads", "-1"}), kUsage, "--threads");
+}
+
+TEST_F(Program, ValuesThatCannotBeExitWith2) {
+  const std::string views = writeRoom("views");
+  expectFailure(complete(views, {"--bounds", "1", "1", "1", "0", "2", "2"}), kUsage, "--bounds");
+  expectFailure(complete(views, {"--bounds", "0", "0", "0", "1", "1", "nan"}), kUsage, "--bounds");
+  expectFailure(complete(views, {"--bounds", "0", "0", "0", "1"}), kUsage, "--bounds");
+  expectFailure(complete(views, {"--up", "0", "0", "0"}), kUsage, "--up");
+  expectFailure(complete(views, {"--margin", "nan"}), kUsage, "--margin");
+  expectFailure(complete(views, {"--tau", "1.5"}), kUsage, "--tau");
+  for (const char* frames : {"3-", "2-1", "0,,1", "0;1"})
+    expectFailure(complete(views, {std::string("--frames=") + frames}), kUsage, frames);
+}
+
+TEST_F(Program, FramesOutOfRangeNameTheViews) {
+  const std::string views = writeRoom("views");
+  expectBadViews(views, "", {"--frames", "2"});
+  expectBadViews(views, "", {"--frames", "0,1,5-9"});
+  writeViewExr(roomViews(1)[0], at("one.exr"));
+  expectBadViews(at("one.exr"), "", {"--frames", "1"});
+}
+
+TEST_F(Program, HelpOfEveryVerbListsTheCommonOptions) {
+  const std::vector<Args> verbs = {
+      {}, {"info"}, {"render"}, {"check"}, {"eval"}, {"train", "encoder"}, {"train", "mar"}};
+  for (Args args : verbs) {
+    args.push_back("--help");
+    SCOPED_TRACE(testing::PrintToString(args));
+    const Ended ended = run(args);
+    EXPECT_EQ(ended.code, kOk);
+    EXPECT_EQ(ended.err, "");
+    for (const char* option : {"--help", "--seed", "--threads", "--json"})
+      EXPECT_NE(ended.out.find(option), std::string::npos) << option;
+    if (args.size() > 1) continue;
+    for (const Args& verb : verbs)  // the front page lists them all
+      if (!verb.empty()) {
+        EXPECT_NE(ended.out.find("\n  " + verb[0] + " "), std::string::npos) << verb[0];
+      }
+  }
+}
+
+TEST_F(Program, InfoIsOneJsonObject) {
+  const Ended ended = run({"info", "--json", "--threads", "1"});
+  EXPECT_EQ(ended.code, kOk);
+  const json info = json::parse(ended.out);
+  EXPECT_FALSE(info.at("blas").get<std::string>().empty());
+  EXPECT_FALSE(info.at("core").get<std::string>().empty());
+  EXPECT_FALSE(info.at("version").get<std::string>().empty());
+  EXPECT_EQ(info.at("threads"), 1);
+  EXPECT_GT(info.at("gflops").get<double>(), 0);
+}
+
+TEST_F(Program, EvalRefusesTrainingRooms) {
+  for (const char* seed : {"900000", "1000005", "2099999"})
+    expectFailure({"eval", "--scenes", std::string("rooms:") + seed, "--weights", VDBC_WEIGHTS},
+                  kFailed, seed);
+  expectFailure({"eval", "--scenes", "rooms:899999-900000", "--weights", VDBC_WEIGHTS}, kFailed,
+                "900000");
+  expectFailure({"eval", "--scenes", "rooms:one"}, kUsage, "rooms:one");
+  expectFailure({"eval", "--scenes", at("missing"), "--weights", VDBC_WEIGHTS}, kFailed,
+                at("missing"));
+}
+
+// ---- views that cannot be used
+
+TEST_F(Program, ViewsThatAreNotThere) {
+  expectBadViews(at("missing"));
+  fs::create_directory(at("empty"));
+  expectBadViews(at("empty"));
+  writeText(at("notes.txt"), "no views");
+  expectBadViews(at("notes.txt"));
+  writeText(at("transforms.json"), R"({"fl_x": 50, "w": 64, "h": 48, "frames": []})");
+  expectBadViews(at("transforms.json"));
+}
+
+TEST_F(Program, CorruptJson) {
+  const std::string views = writeRoom("views"), path = views + "/transforms.json";
+  const std::string text = readText(path);
+  for (size_t length : {size_t(0), text.size() / 3, text.size() - 3}) {
+    writeText(path, text.substr(0, length));
+    expectBadViews(views, path);
+  }
+  writeText(path, "[1, 2]");
+  expectBadViews(views, path);
+  json singular = json::parse(text);
+  for (auto& row : singular["frames"][1]["transform_matrix"]) row = {0, 0, 0, 0};
+  writeText(path, singular.dump());
+  expectBadViews(views, path);
+}
+
+TEST_F(Program, CorruptPictures) {
+  const std::string views = writeRoom("views");
+  for (const std::string name : {"/color/00001.png", "/depth/00001.png"}) {
+    const std::string path = views + name, whole = readText(path);
+    for (const std::string& damaged :
+         {std::string("not a picture"), whole.substr(0, whole.size() / 2)}) {
+      writeText(path, damaged);
+      expectBadViews(views, path);
+    }
+    fs::remove(path);
+    expectBadViews(views, path);
+    writeText(path, whole);
+  }
+}
+
+TEST_F(Program, CorruptExr) {
+  writeViewExr(roomViews(1)[0], at("one.exr"));
+  const std::string whole = readText(at("one.exr"));
+  for (size_t length : {size_t(5), size_t(300), whole.size() / 2}) {
+    writeText(at("one.exr"), whole.substr(0, length));
+    expectBadViews(at("one.exr"));
+  }
+}
+
+TEST_F(Program, ViewsWithoutDepth) {
+  const std::string views = writeRoom("views"), path = views + "/transforms.json";
+  json transforms = json::parse(readText(path));
+  for (auto& frame : transforms["frames"]) frame.erase("depth_file_path");
+  writeText(path, transforms.dump());
+  expectBadViews(views, path);
+}
+
+TEST_F(Program, DepthWithoutOneMeasurement) {
+  const std::string views = writeRoom("views");
+  writePng16(std::vector<uint16_t>(64 * 48, 0), 64, 48, views + "/depth/00001.png");
+  expectBadViews(views);
+  View view = roomViews(1)[0];
+  std::fill(view.depth.begin(), view.depth.end(), std::numeric_limits<float>::quiet_NaN());
+  writeViewExr(view, at("nan.exr"));
+  expectBadViews(at("nan.exr"));
+}
+
+TEST_F(Program, SizesThatDoNotMatch) {
+  const std::string views = writeRoom("views");
+  writePng16(std::vector<uint16_t>(32 * 48, 2000), 32, 48, views + "/depth/00000.png");
+  expectBadViews(views);
+  const std::string again = writeRoom("again");
+  writePng(Image(64, 40, 3, .5f), again + "/color/00000.png");
+  expectBadViews(again);
+}
+
+TEST_F(Program, CamerasThatSeeNothing) {
+  NEEDS_WEIGHTS();
+  const std::string views = writeRoom("views");
+  expectBadViews(views, "", {"--bounds", "500", "500", "500", "503", "503", "503"});
+  writePng16(std::vector<uint16_t>(64 * 48, 60000), 64, 48, views + "/depth/00000.png");  // 60 m
+  expectBadViews(views, "", {"--frames", "0"});
+}
+
+// ---- other files that cannot be used
+
+TEST_F(Program, CorruptVolumesAndSplats) {
+  const std::string views = writeRoom("views");
+  const std::string volume = writeVolume(), splats = writeSplats();
+  for (const std::string& path : {volume, splats}) {
+    const std::string whole = readText(path);
+    for (size_t length : {size_t(10), whole.size() / 2, whole.size() * 9 / 10}) {
+      writeText(path, whole.substr(0, length));
+      if (path == volume)
+        expectFailure({"check", views, path}, kFailed, path);
+      else
+        expectFailure({"render", path, "--cameras", views, "-o", output_}, kFailed, path);
+    }
+  }
+  expectFailure({"check", views, at("missing.vdb")}, kFailed, at("missing.vdb"));
+  writeText(at("points.vdb"), "neither points nor a grid");
+  expectFailure({"render", at("points.vdb"), "--cameras", views, "-o", output_}, kFailed,
+                at("points.vdb"));
+}
+
+TEST_F(Program, WeightsThatAreNone) {
+  const std::string views = writeRoom("views");
+  const std::string folder = at("weights"), encoder = folder + "/encoder.safetensors";
+  fs::create_directory(folder);
+  const Args args = {views, "-o", output_ + "/x.vdb", "--weights", folder};
+  expectFailure(args, kFailed, encoder);
+  const std::string empty_header("\x02\0\0\0\0\0\0\0{}", 10);  // valid, holds nothing
+  for (const std::string& text : {std::string(64, '\xff'), std::string(64, '\0'), empty_header}) {
+    writeText(encoder, text);
+    expectFailure(args, kFailed, encoder);
+  }
+}
+
+TEST_F(Program, WeightsThatAreDamagedOrOfTheOtherNetwork) {
+  NEEDS_WEIGHTS();
+  const std::string views = writeRoom("views");
+  const std::string folder = at("weights"), encoder = folder + "/encoder.safetensors",
+                    completer = folder + "/completer.safetensors";
+  fs::create_directory(folder);
+  const Args args = {views, "-o", output_ + "/x.vdb", "--weights", folder};
+  fs::copy_file(VDBC_WEIGHTS "/encoder.safetensors", encoder);
+  expectFailure(args, kFailed, completer);
+  fs::copy_file(VDBC_WEIGHTS "/encoder.safetensors", completer);
+  expectFailure(args, kFailed, completer);
+  const std::string whole = readText(encoder);
+  for (size_t length : {size_t(4), size_t(100), whole.size() - 1}) {
+    writeText(encoder, whole.substr(0, length));
+    expectFailure(args, kFailed, encoder);
+  }
+  fs::remove(encoder);
+  fs::copy_file(VDBC_WEIGHTS "/completer.safetensors", encoder);
+  expectFailure(args, kFailed, encoder);
+}
+
+// ---- places that cannot be written to
+
+TEST_F(Program, OutputsThatCannotBe) {
+  const std::string views = writeRoom("views"), splats = writeSplats();
+  writeText(at("file"), "");
+  for (const std::string& name : {output_ + "/x.ply", output_ + "/.vdb", output_})
+    expectFailure({views, "-o", name, "--weights", VDBC_WEIGHTS}, kUsage, name);
+  for (const std::string& folder : {at("file"), at("file") + "/deeper", std::string("/proc")})
+    expectFailure({views, "-o", folder + "/x.vdb", "--weights", VDBC_WEIGHTS}, kFailed, folder);
+  expectFailure({"train", "encoder", "-o", output_}, kUsage, output_);
+  expectFailure(
+      {"train", "encoder", "-o", at("file") + "/x.safetensors", "--work", output_ + "/work"},
+      kFailed, at("file"));
+  fs::create_directory(output_ + "/x.ply");
+  expectFailure(complete(views), kFailed, output_ + "/x.ply");
+  expectFailure({"render", splats, "--cameras", views, "-o", at("file")}, kFailed, at("file"));
+  expectFailure({"render", splats, "--cameras", views, "-o", "/proc"}, kFailed, "/proc");
+}
+
+// ---- what it does
+
+TEST_F(Program, BundledViewsCompleteToFourFiles) {
+  NEEDS_WEIGHTS();
+  const std::string views = VDBC_SOURCE_DIR "/examples/two_views";
+  if (!fs::exists(views)) GTEST_SKIP() << "no " << views;
+  const Ended ended = run(complete(views));
+  EXPECT_EQ(ended.code, kOk);
+  EXPECT_EQ(ended.err, "");  // progress is for terminals
+  EXPECT_EQ(listing(output_), kSiblings);
+  const SceneVoxels voxels = readSceneVdb(output_ + "/x.vdb");
+  const int64_t gaussians = readPly(output_ + "/x.ply").size();
+  EXPECT_GT(std::count(voxels.observed.begin(), voxels.observed.end(), 1), 0);
+  EXPECT_GT(std::count(voxels.observed.begin(), voxels.observed.end(), 0), 0)
+      << "nothing was generated";
+  EXPECT_GE(gaussians, int64_t(voxels.ijk.size()));
+  Provenance provenance;
+  EXPECT_EQ(readPointsVdb(output_ + "/x.points.vdb", &provenance).size(), gaussians);
+  const Image sheet = readImage(output_ + "/x.png");
+  EXPECT_GT(sheet.width * sheet.height, 100 * 100);
+}
+
+TEST_F(Program, ObservedVoxelsAreTheCarvedViews) {
+  NEEDS_WEIGHTS();
+  const std::string folder = writeRoom("views");
+  const Ended ended = run(complete(folder, {"--json", "--coarse-tau", "0.9"}));
+  ASSERT_EQ(ended.code, kOk) << ended.err;
+  const SceneVoxels written = readSceneVdb(output_ + "/x.vdb");
+
+  const std::vector<View> views = readViews(folder);
+  std::vector<DepthView> depth;
+  for (const View& v : views) depth.push_back(v.depthView());
+  VolumeSettings volume;
+  volume.voxel_m = written.frame.voxel_m;
+  const VoxelFrame frame = fitVolume(depth, volume, {});
+  EXPECT_EQ(written.frame.bounds, frame.bounds);
+  EXPECT_TRUE(written.frame.world_from_grid.isApprox(frame.world_from_grid, 1e-6));
+  const ObservedSpace space = carveByTraversal(frame, depth, {});
+  std::set<Coord> expected, found;
+  for (auto v = space.filled.cbeginValueOn(); v; ++v) expected.insert(v.getCoord());
+  for (size_t i = 0; i < written.ijk.size(); ++i)
+    if (written.observed[i]) found.insert(written.ijk[i]);
+  EXPECT_EQ(found, expected);
+
+  // The same numbers in what it says.
+  const json result = json::parse(ended.out);
+  EXPECT_EQ(result.at("views"), 2);
+  EXPECT_EQ(result.at("voxels"), written.ijk.size());
+  EXPECT_EQ(result.at("gaussians"), readPly(output_ + "/x.ply").size());
+  std::set<std::string> stages;
+  for (const std::string& line : lines(ended.err)) {
+    const json progress = json::parse(line);
+    stages.insert(progress.at("stage").get<std::string>());
+    EXPECT_GE(progress.at("percent").get<int>(), 0);
+    EXPECT_LE(progress.at("percent").get<int>(), 100);
+  }
+  EXPECT_EQ(stages,
+            (std::set<std::string>{"carve", "complete", "decode", "encode", "read", "write"}));
+}
+
+TEST_F(Program, TheSeedFixesEveryByteOfThePly) {
+  NEEDS_WEIGHTS();
+  const std::string views = writeRoom("views");
+  std::map<std::string, std::string> bytes;
+  for (const char* seed : {"5", "5 again", "6"}) {
+    Args options = smallBox();
+    options.insert(options.end(),
+                   {"--sampling-steps", "2", "--seed", std::string(seed).substr(0, 1)});
+    const Ended ended = run(complete(views, options));
+    ASSERT_EQ(ended.code, kOk) << ended.err;
+    bytes[seed] = readText(output_ + "/x.ply");
+  }
+  EXPECT_TRUE(bytes["5"] == bytes["5 again"]);
+  EXPECT_FALSE(bytes["5"] == bytes["6"]) << "the seed has no effect";
+}
+
+TEST_F(Program, RenderShowsTheSplatsFromTheCameras) {
+  const std::string folder = writeRoom("views");
+  const std::vector<View> views = readViews(folder);
+  // Every pixel becomes a splat of its size and colour: the pictures come back.
+  Gaussians g;
+  for (const View& v : views)
+    for (int y = 0; y < v.camera.height; ++y)
+      for (int x = 0; x < v.camera.width; ++x) {
+        const float z = v.depth[size_t(y * v.camera.width + x)];
+        if (z <= 0) continue;
+        g.mean.push_back(v.camera.unproject(x + .5, y + .5, z).cast<float>());
+        g.log_scale.push_back(Eigen::Vector3f::Constant(std::log(.5f * z / float(v.camera.fx))));
+        g.rotation.emplace_back(1, 0, 0, 0);
+        g.opacity_logit.push_back(5);
+        for (int c = 0; c < 3; ++c) g.sh.push_back((v.colour.at(x, y, c) - .5f) / kSh0);
+      }
+  writePly(g, at("pixels.ply"));
+  const Ended ended =
+      run({"render", at("pixels.ply"), "--cameras", folder, "-o", output_, "--json"});
+  EXPECT_EQ(ended.code, kOk) << ended.err;
+  EXPECT_EQ(listing(output_), (Args{"0000.png", "0001.png"}));
+  const std::vector<std::string> said = lines(ended.out);
+  ASSERT_EQ(said.size(), 2u);
+  for (size_t i = 0; i < 2; ++i) {
+    const Image shown = readImage(json::parse(said[i]).at("image").get<std::string>());
+    ASSERT_EQ(shown.width, 64);
+    ASSERT_EQ(shown.height, 48);
+    EXPECT_GT(psnr(shown, rasterize(readPly(at("pixels.ply")), views[i].camera, {}).colour), 50);
+    EXPECT_GT(psnr(shown, views[i].colour), 15);
+    EXPECT_GT(psnr(shown, views[i].colour), psnr(shown, views[1 - i].colour) + 3);
+  }
+  writePointsVdb(g, {}, at("pixels.points.vdb"));
+  const Ended points = run({"render", at("pixels.points.vdb"), "--cameras", folder, "--frames", "1",
+                            "--width", "32", "-o", output_ + "/small"});
+  EXPECT_EQ(points.code, kOk) << points.err;
+  EXPECT_EQ(listing(output_ + "/small"), Args{"0000.png"});
+  const Image small = readImage(output_ + "/small/0000.png");
+  EXPECT_EQ(small.width, 32);
+  EXPECT_EQ(small.height, 24);
+  EXPECT_GT(psnr(small, rasterize(g, resized(views[1].camera, 32, 24), {}).colour), 30);
+}
+
+TEST_F(Program, CheckFindsCarvedVoxelsInAgreement) {
+  const std::string folder = writeRoom("views");
+  const std::vector<View> views = readViews(folder);
+  std::vector<DepthView> depth;
+  size_t rays = 0;
+  for (const View& v : views) {
+    depth.push_back(v.depthView());
+    rays += size_t(std::count_if(v.depth.begin(), v.depth.end(), [](float z) { return z > 0; }));
+  }
+  CarveSettings all;
+  all.flying_pixel_ratio = 0;
+  SceneVoxels v;
+  v.frame = fitVolume(depth, {}, all);
+  const ObservedSpace space = carveByTraversal(v.frame, depth, all);
+  for (auto voxel = space.filled.cbeginValueOn(); voxel; ++voxel) {
+    v.ijk.push_back(voxel.getCoord());
+    v.colour_linear.emplace_back(.5f, .5f, .5f);
+    v.density.push_back(1), v.observed.push_back(1), v.probability.push_back(1),
+        v.bfs_level.push_back(0);
+  }
+  writeSceneVdb(v, at("carved.vdb"));
+  const Ended ended = run({"check", folder, at("carved.vdb"), "--json"});
+  EXPECT_EQ(ended.code, kOk) << ended.err;
+  const json result = json::parse(ended.out);
+  EXPECT_EQ(result.at("voxels"), v.ijk.size());
+  EXPECT_EQ(result.at("rays"), rays);
+  // Voxels hold the points: no ray goes past its own but for points outside the trimmed volume.
+  EXPECT_LT(result.at("missed").get<double>(), .01);
+  EXPECT_LT(result.at("median_depth_error_m").get<double>(), v.frame.voxel_m * std::sqrt(3.));
+  EXPECT_GT(result.at("within_two_voxels").get<double>(), .8);
+  EXPECT_GT(result.at("open_directions").get<double>(), 0);  // two views see a part of the room
+  EXPECT_LT(result.at("open_directions").get<double>(), 1);
+}
+
+TEST_F(Program, EvalPrintsEveryMethodOnce) {
+  NEEDS_WEIGHTS();
+  const std::string folder = writeRoom("views", 3);
+  const Ended ended = run({"eval", "--scenes", folder, "--views", "2", "--weights", VDBC_WEIGHTS,
+                           "--coarse-tau", "1", "--json"});
+  ASSERT_EQ(ended.code, kOk) << ended.err;
+  std::map<std::string, int> scene, mean;
+  for (const std::string& line : lines(ended.out)) {
+    const json result = json::parse(line);
+    ++(result.at("scene") == "mean" ? mean : scene)[result.at("method").get<std::string>()];
+    EXPECT_GT(result.at("psnr").get<double>(), 0);
+  }
+  const std::map<std::string, int> once = {
+      {"box", 1}, {"completed", 1}, {"nearest", 1}, {"observed", 1}};
+  EXPECT_EQ(scene, once);
+  EXPECT_EQ(mean, once);
+  expectFailure({"eval", "--scenes", folder, "--views", "3", "--weights", VDBC_WEIGHTS}, kFailed,
+                folder);
+}
+
+TEST_F(Program, AnInterruptLeavesNothing) {
+  NEEDS_WEIGHTS();
+  const std::string views = writeRoom("views");
+  Args options = smallBox();
+  options.push_back("--json");
+  for (const char* stage : {"read", "complete", "write"}) {
+    SCOPED_TRACE(stage);
+    const Ended ended = run(complete(views, options), stage);
+    ASSERT_FALSE(ended.err.empty());
+    if (ended.code == kOk) {  // it was faster than the signal
+      EXPECT_EQ(listing(output_), kSiblings);
+      for (const std::string& name : kSiblings) fs::remove(output_ + "/" + name);
+      continue;
+    }
+    EXPECT_EQ(ended.code, kInterrupted);
+    EXPECT_EQ(ended.out, "");
+    EXPECT_EQ(lines(ended.err).back(), "vdb_complete: interrupted");
+    EXPECT_EQ(listing(output_), Args{});
+  }
+  // What was there before stays.
+  for (const std::string& name : kSiblings) writeText(output_ + "/" + name, "older");
+  if (run(complete(views, options), "read").code != kInterrupted) return;
+  EXPECT_EQ(listing(output_), kSiblings);
+  for (const std::string& name : kSiblings) EXPECT_EQ(readText(output_ + "/" + name), "older");
+}
+
+}  // namespace
+}  // namespace vdbc
