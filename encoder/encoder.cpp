@@ -92,6 +92,7 @@ std::string Encoder::trainedOn() const { return impl_->trained_on; }
 ObservationSettings Encoder::observationSettings() const {
   ObservationSettings s;
   s.patches_across = config().patches_across;
+  s.level = config().levels;
   return s;
 }
 

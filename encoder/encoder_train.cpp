@@ -105,6 +105,7 @@ GaussianTensors decodeForTraining(EncoderNet& net, const Tensor& z, const Encode
 Observation observeForTraining(const std::vector<View>& views, const EncoderConfig& c) {
   ObservationSettings settings;
   settings.patches_across = c.patches_across;
+  settings.level = c.levels;
   VolumeSettings volume;
   volume.voxel_m = c.voxel_m, volume.margin_m = .4f;
   std::vector<DepthView> depth;
@@ -243,7 +244,7 @@ std::pair<double, double> encoderStepLoss(const EncoderConfig& config, const std
                                           uint64_t seed) {
   torch::manual_seed(seed);
   auto net = std::make_shared<EncoderNet>(config);
-  torch::optim::AdamW optimiser(net->parameters(), torch::optim::AdamWOptions(1e-3));
+  torch::optim::AdamW optimiser(net->parameters(), torch::optim::AdamWOptions(1e-4));
   double loss[2];
   for (double& value : loss) {
     torch::Generator random = at::detail::createCPUGenerator(seed);

@@ -105,28 +105,16 @@ EncoderInput encoderInput(const std::vector<View>& views, const Observation& o,
   in.patches = patchPixels(views, o, config.patch_px);
   in.patch_geometry = patchGeometry(views, o);
 
-  // The observation counts pixels per level-1 token; other levels add them up or share them out.
-  std::vector<int32_t> rows, columns;
-  std::vector<float> counts;
-  auto add = [&](int32_t row, int32_t k, float count) {
-    rows.push_back(row), columns.push_back(o.patch[size_t(k)]), counts.push_back(count);
-  };
-  std::map<std::pair<int32_t, int32_t>, float> merged;  // level 2 only
-  for (int32_t v = 0; v < o.tokens.size(1); ++v)
-    for (int32_t k = o.row_begin[size_t(v)]; k < o.row_begin[size_t(v) + 1]; ++k) {
-      const float count = o.count[size_t(k)];
-      if (config.levels == 1) add(v, k, count);
-      if (config.levels == 2) merged[{o.tokens.parents(1)[size_t(v)], o.patch[size_t(k)]}] += count;
-      if (config.levels == 0)
-        for (int32_t child : o.tokens.children(1)[size_t(v)])
-          if (child >= 0) add(child, k, count);
-    }
-  for (const auto& [pair, count] : merged)
-    rows.push_back(pair.first), columns.push_back(pair.second), counts.push_back(count);
-  in.voxels_from_patches = countAttention(rows, columns, counts, in.coords.size(0), o.patches,
-                                          config.guide_log_counts);
-  in.patches_from_voxels = countAttention(columns, rows, counts, o.patches, in.coords.size(0),
-                                          config.guide_log_counts);
+  const int64_t tokens = in.coords.size(0);
+  require(int64_t(o.row_begin.size()) == tokens + 1,
+          "encoderInput: the observation counts pixels of another tree level than the latents'");
+  std::vector<int32_t> rows;
+  for (int32_t v = 0; v < tokens; ++v)
+    rows.insert(rows.end(), size_t(o.row_begin[size_t(v) + 1] - o.row_begin[size_t(v)]), v);
+  in.voxels_from_patches =
+      countAttention(rows, o.patch, o.count, tokens, o.patches, config.guide_log_counts);
+  in.patches_from_voxels =
+      countAttention(o.patch, rows, o.count, o.patches, tokens, config.guide_log_counts);
   return in;
 }
 
@@ -156,7 +144,7 @@ void BidirectionalBlock::forward(Tensor* x3, Tensor* x2, const EncoderInput& in,
   if (!self2) return;
   *x2 = *x2 + cross2->guided(norm2->forward(*x2), context3->forward(*x3), share(),
                              [&](const Tensor& v) { return in.patches_from_voxels.apply(v); });
-  *x2 = self2->forward(*x2, nullptr, torch::arange(x2->size(0)), 4 * config.window, layer % 2 == 1);
+  *x2 = self2->forward(*x2, nullptr, {}, int(x2->size(0)), false);  // full: views have no order
 }
 
 EncoderNet::EncoderNet(const EncoderConfig& c) : config(c) {

@@ -102,14 +102,17 @@ void poolVoxelFeatures(const std::vector<std::vector<PixelPoint>>& points, Obser
 }
 
 // Sorted (token, patch) pairs become compressed sparse rows.
-void countPatches(const std::vector<std::vector<PixelPoint>>& points, Observation* o) {
-  const auto& node_of_voxel = o->tokens.parents(0);
+void countPatches(const std::vector<std::vector<PixelPoint>>& points, int level, Observation* o) {
+  auto tokenOf = [&](int32_t row) {
+    for (int l = 0; l < level; ++l) row = o->tokens.parents(l)[size_t(row)];
+    return row;
+  };
   std::vector<uint64_t> pairs;
   for (const auto& view : points)
     for (const PixelPoint& p : view)
-      pairs.push_back(uint64_t(node_of_voxel[size_t(p.voxel)]) << 32 | uint64_t(p.patch));
+      pairs.push_back(uint64_t(tokenOf(p.voxel)) << 32 | uint64_t(p.patch));
   std::sort(pairs.begin(), pairs.end());
-  o->row_begin.assign(size_t(o->tokens.size(1)) + 1, 0);
+  o->row_begin.assign(size_t(o->tokens.size(level)) + 1, 0);
   for (size_t i = 0; i < pairs.size();) {
     size_t end = i;
     while (end < pairs.size() && pairs[end] == pairs[i]) ++end;
@@ -161,7 +164,7 @@ Observation observe(const std::vector<View>& views, const VoxelFrame& frame,
   });
   report(progress, -1);
   poolVoxelFeatures(points, &o);
-  countPatches(points, &o);
+  countPatches(points, settings.level, &o);
   meanPatchPoints(views, points, &o);
   return o;
 }

@@ -30,8 +30,8 @@ struct Observation {
   int patches = 0;                    // of all views
   /// Mean point of each patch's pixels in grid metres and its share of valid pixels, [patches, 4].
   std::vector<float> patch_points;
-  /// Pixels of patch p whose point lies in token v of level 1, as compressed sparse rows over v.
-  std::vector<int32_t> row_begin;     // [N1 + 1]
+  /// Pixels of patch p whose point lies in token v of the latent level, as compressed sparse rows over v.
+  std::vector<int32_t> row_begin;     // [N + 1]
   std::vector<int32_t> patch;         // [nnz]
   std::vector<float> count;           // [nnz]
 };
@@ -39,6 +39,7 @@ struct Observation {
 struct ObservationSettings {
   CarveSettings carving;
   int patches_across = 14;  // patches along the image's width; rows follow the aspect ratio
+  int level = 1;            // tree level of the latents, whose tokens' pixels are counted
 };
 
 /// Throws Error if no pixel of any view falls into the frame's bounds.

@@ -147,11 +147,13 @@ std::string weightsHash(const torch::nn::Module& module) {
     for (size_t i = 0; i < bytes; ++i)
       hash = (hash ^ static_cast<const unsigned char*>(data)[i]) * 1099511628211ull;
   };
-  for (const auto& p : module.named_parameters()) {
-    const Tensor t = p.value().detach().contiguous();
-    add(p.key().data(), p.key().size());
+  auto addTensor = [&](const std::string& name, const Tensor& value) {
+    const Tensor t = value.detach().contiguous();
+    add(name.data(), name.size());
     add(t.data_ptr(), t.nbytes());
-  }
+  };
+  for (const auto& p : module.named_parameters()) addTensor(p.key(), p.value());
+  for (const auto& b : module.named_buffers()) addTensor(b.key(), b.value());
   char text[17];
   std::snprintf(text, sizeof text, "%016llx", static_cast<unsigned long long>(hash));
   return text;

@@ -58,16 +58,26 @@ EvaluationScene roomScene(uint64_t seed, int views) {
   return s;
 }
 
-EvaluationScene folderScene(const std::string& folder, int views, uint64_t seed) {
+EvaluationScene folderScene(const std::string& folder, int views, std::vector<int> frames, uint64_t seed) {
   EvaluationScene s;
   s.name = folder;
   s.up = conventionalUp(folder);
-  std::vector<View> all = readViews(folder);
-  require(int(all.size()) > views, "eval: ", folder, ": expected more than ", views, " frames, found ", all.size());
-  std::mt19937_64 random(seed);
-  for (size_t i = all.size() - 1; i > 0; --i) std::swap(all[i], all[random() % (i + 1)]);
-  s.input.assign(all.begin(), all.begin() + views);
-  s.targets.assign(all.begin() + views, all.end());
+  const std::vector<View> all = readViews(folder);
+  if (frames.empty()) {
+    frames.resize(all.size());
+    std::iota(frames.begin(), frames.end(), 0);
+    std::mt19937_64 random(seed);
+    for (size_t i = all.size() - 1; i > 0; --i) std::swap(frames[i], frames[random() % (i + 1)]);
+    frames.resize(std::min(frames.size(), size_t(views)));
+  }
+  require(frames.size() < all.size(), "eval: ", folder, ": expected more than ", frames.size(),
+          " frames, found ", all.size());
+  for (int f = 0; f < int(all.size()); ++f) {
+    const bool input = std::find(frames.begin(), frames.end(), f) != frames.end();
+    (input ? s.input : s.targets).push_back(all[size_t(f)]);
+  }
+  require(s.input.size() == frames.size(), "eval: ", folder, ": --frames: expected different numbers below ",
+          all.size());
   return s;
 }
 
@@ -186,7 +196,7 @@ MethodResult measure(const std::string& method, const EvaluationScene& scene, co
 
 }  // namespace
 
-SceneList sceneList(const std::string& spec, int views, uint64_t seed) {
+SceneList sceneList(const std::string& spec, int views, const std::vector<int>& frames, uint64_t seed) {
   if (spec.rfind("rooms:", 0) == 0) {
     unsigned long long first = 0, last = 0;
     int used = 0;
@@ -195,10 +205,11 @@ SceneList sceneList(const std::string& spec, int views, uint64_t seed) {
     if (found == 1) last = first;
     if (found < 1 || text[used] != '\0' || last < first || last - first > 100000)
       throw UsageError(joinText("--scenes: ", spec, ": expected rooms:SEED or rooms:SEED-SEED"));
+    if (!frames.empty()) throw UsageError("--frames: expected a folder as --scenes, found rooms");
     for (uint64_t s : {uint64_t(first), uint64_t(last)}) requireHeldOut(s);
     return {int64_t(last - first + 1), [=](int64_t i) { return roomScene(first + uint64_t(i), views); }};
   }
-  return {1, [=](int64_t) { return folderScene(spec, views, seed); }};
+  return {1, [=](int64_t) { return folderScene(spec, views, frames, seed); }};
 }
 
 std::string resultJson(const MethodResult& r) {

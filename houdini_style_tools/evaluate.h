@@ -20,13 +20,13 @@ struct EvaluationScene {
 };
 
 /// Scenes named by SPEC: `rooms:SEED-SEED` (or rooms:SEED), or a folder with transforms.json of which
-/// `views` random frames are input and the rest targets.
+/// `views` random frames, or those of `frames`, are input and the rest targets.
 struct SceneList {
   int64_t count = 0;
   std::function<EvaluationScene(int64_t)> scene;
 };
-/// Throws UsageError for a SPEC that is neither, Error for seeds reserved for training.
-SceneList sceneList(const std::string& spec, int views, uint64_t seed);
+/// Throws UsageError for a malformed SPEC, Error for seeds reserved for training.
+SceneList sceneList(const std::string& spec, int views, const std::vector<int>& frames, uint64_t seed);
 
 /// What one method reached on one scene; NaN is printed as null (0/0, or no truth).
 struct MethodResult {

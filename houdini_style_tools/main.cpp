@@ -46,7 +46,7 @@ struct Check {
   std::string views, frames, volume;
 };
 struct Evaluate {
-  std::string scenes, weights;
+  std::string scenes, frames, weights;
   int views = 2;
 };
 struct Train {
@@ -220,7 +220,7 @@ void cookCheck(const Check& o, const Common& common) {
 }
 
 void cookEvaluate(const Evaluate& o, const Complete& options, const Common& common, Progress& progress) {
-  const SceneList scenes = sceneList(o.scenes, o.views, common.seed);
+  const SceneList scenes = sceneList(o.scenes, o.views, frameList(o.frames), common.seed);
   const std::string weights = weightsFolder(o.weights);
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
@@ -392,6 +392,7 @@ int run(int argc, char** argv) {
   CLI::App* verb_eval = app.add_subcommand("eval", "compares all methods on scenes that were never trained on");
   verb_eval->add_option("--scenes", evaluate.scenes, "rooms:SEED-SEED, or a folder with transforms.json")->required();
   verb_eval->add_option("--views", evaluate.views, "input views a scene")->check(CLI::Range(1, 1000))->capture_default_str();
+  verb_eval->add_option("--frames", evaluate.frames, "input frames of a folder [--views random ones]");
   verb_eval->add_option("--weights", evaluate.weights, "folder with encoder.safetensors and completer.safetensors");
   addCompletion(verb_eval, &eval_options);
   CLI::App* verb_train = app.add_subcommand("train", "trains a network on procedural rooms");

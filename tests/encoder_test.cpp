@@ -448,7 +448,7 @@ TEST(EncoderNet, GaussiansStayNearTheirSubLattice) {  // E11
     const float h = .2f;
     const int64_t m = int64_t(per_axis) * per_axis * per_axis;
     const GaussianTensors g =
-        net->gaussians(torch::randn({20, c.voxel_width}), coordTensor(voxels), h);
+        net->gaussians(torch::randn({20, c.voxel_width + 3}), coordTensor(voxels), h);
     ASSERT_EQ(g.mean.sizes(), (std::vector<int64_t>{20 * m, 3}));
     ASSERT_EQ(g.sh.sizes(), (std::vector<int64_t>{20 * m, 1, 3}));
     double farthest = 0;

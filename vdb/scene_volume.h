@@ -18,8 +18,8 @@ struct VolumeSettings {
   Eigen::Vector3d up = Eigen::Vector3d::UnitZ();
   /// World box (min, max corners, metres) to complete; else fitted to what was seen.
   std::optional<Eigen::AlignedBox3d> bounds;
-  float margin_m = 1.0f;           // horizontal room for what was not seen, when fitted
-  float vertical_margin_m = 0.2f;  // the same above and below
+  float margin_m = 1.5f;           // horizontal room for what was not seen, when fitted
+  float vertical_margin_m = 0.4f;  // the same above and below
   bool align_walls = true;         // turn the grid about `up` so that walls lie along its axes
 };
 
