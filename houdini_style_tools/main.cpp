@@ -290,7 +290,7 @@ void cookTrainEncoder(const Train& t, const Common& common, Progress& progress) 
 }
 
 void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
-  constexpr int kValidationRooms = 16;
+  constexpr int kValidationRooms = 8;
   const Encoder encoder(t.encoder);
   CompleterConfig config = t.preset == "paper" ? CompleterConfig::paper() : CompleterConfig::small();
   config.latent_dim = encoder.config().latent_dim;
@@ -298,6 +298,7 @@ void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
   s.metadata["trained_on"] = seedRange(kCompleterTrainingSeed, t.scenes);
   s.metadata["validated_on"] = seedRange(kValidationSeed, kValidationRooms);
   s.metadata["encoder_hash"] = encoder.hash();
+  s.validate_every = 1000;  // roll-outs take seconds each
   // Samples depend on the encoder: its hash names their folder.
   const std::string cache = s.work_folder + "/samples_" + encoder.hash();
   auto source = [&](uint64_t first) {

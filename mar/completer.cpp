@@ -19,6 +19,7 @@ CompleterConfig CompleterConfig::paper() {
   c.coarse_width = 512, c.coarse_heads = 16, c.coarse_layers = 2;
   c.diffusion_width = 512, c.paper_snr_weight = true;
   c.context_tokens = 4096, c.empty_tokens = 512, c.chunk_tokens = 2048;
+  c.coarse_chunk_tokens = 8192, c.diffusion_draws = 4;
   c.focal_gamma = 2, c.unobserved_weight = 0;
   return c;
 }
@@ -35,6 +36,7 @@ void visitFields(Config& c, Visit&& visit) {
   visit("rotary_positions", c.rotary_positions), visit("position_code", c.position_code);
   visit("context_tokens", c.context_tokens), visit("empty_tokens", c.empty_tokens);
   visit("chunk_tokens", c.chunk_tokens), visit("coarse_empty_tokens", c.coarse_empty_tokens);
+  visit("coarse_chunk_tokens", c.coarse_chunk_tokens);
   visit("focal_gamma", c.focal_gamma), visit("focal_alpha", c.focal_alpha);
   visit("unobserved_weight", c.unobserved_weight);
 }
@@ -67,6 +69,7 @@ CompleterConfig CompleterConfig::fromJson(const std::string& text, const std::st
   within("context_tokens", c.context_tokens, 1, 1 << 20);
   within("empty_tokens", c.empty_tokens, 0, 1 << 20), within("chunk_tokens", c.chunk_tokens, 1, 1 << 20);
   within("coarse_empty_tokens", c.coarse_empty_tokens, 1, 1 << 20);
+  within("coarse_chunk_tokens", c.coarse_chunk_tokens, 1, 1 << 20);
   require(c.width % (2 * c.heads) == 0 && c.coarse_width % (2 * c.coarse_heads) == 0,
           "CompleterConfig: ", where, ": widths are not multiples of twice their heads");
   return c;
@@ -103,12 +106,18 @@ struct Completer::Impl {
   std::map<Coord, float> coarseGate(const SceneTokens& scene, const VoxelFrame& frame) const {
     std::map<Coord, float> gate;
     for (const Coord& c : scene.coarse_filled) gate[c] = 1;
-    if (scene.coarse_unknown.empty()) return gate;
-    const Tensor p = net->coarseLogits(coarseInputs(scene, {}, scene.coarse_unknown,
-                                                    net->config.coarse_empty_tokens), frame)
-                         .sigmoid().contiguous();
-    for (size_t i = 0; i < scene.coarse_unknown.size(); ++i)
-      gate[scene.coarse_unknown[i]] = p.data_ptr<float>()[i];
+    const std::vector<Coord>& unknown = scene.coarse_unknown;
+    const Tensor order = zOrder(unknown);
+    const int64_t n = int64_t(unknown.size()), size = net->config.coarse_chunk_tokens;
+    const int64_t chunks = (n + size - 1) / size;
+    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+      std::vector<Coord> targets;
+      for (int64_t i = chunk * n / chunks; i < (chunk + 1) * n / chunks; ++i)
+        targets.push_back(unknown[size_t(order.data_ptr<int64_t>()[i])]);
+      const Tensor p = net->coarseLogits(coarseInputs(scene, {}, targets, net->config.coarse_empty_tokens), frame)
+                           .sigmoid().contiguous();
+      for (size_t i = 0; i < targets.size(); ++i) gate[targets[i]] = p.data_ptr<float>()[i];
+    }
     return gate;
   }
 

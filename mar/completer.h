@@ -15,13 +15,13 @@ struct CompleterConfig {
   int latent_dim = 32;
   int width = 128, heads = 4, layers = 3;               // fine stage; layers each in H1 and H2
   int coarse_width = 96, coarse_heads = 3, coarse_layers = 2;  // coarse stage, one tree level up
-  int diffusion_width = 256, diffusion_steps = 1000, diffusion_draws = 4;
+  int diffusion_width = 256, diffusion_steps = 1000, diffusion_draws = 2;
   bool paper_snr_weight = false;  // SNR / (1 + SNR) instead of min(1 / alpha_bar, 20)
   bool rotary_positions = true;   // 3-D RoPE in self-attention
   bool position_code = true;      // sinusoidal code on every token
   // What the fine stage sees around a chunk of targets, nearest first.
   int context_tokens = 384, empty_tokens = 64, chunk_tokens = 160;
-  int coarse_empty_tokens = 256;
+  int coarse_empty_tokens = 256, coarse_chunk_tokens = 1024;
   // Loss.
   float focal_gamma = 0, focal_alpha = .5f;
   float unobserved_weight = .25f;  // of U, labelled empty; 0 masks U from the loss as in the paper

@@ -135,25 +135,40 @@ struct TargetRows {
   }
 };
 
-// The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities there.
-Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s,
-                  torch::Generator& random, std::map<Coord, float>* gate) {
-  for (const Coord& c : scene.coarse_filled) (*gate)[c] = 1;
-  const auto [visible, targets] = drawCoarseMask(scene.coarse_unknown, s.target_coarse, random);
-  for (const Coord& c : visible) (*gate)[c] = 1;
-  if (targets.empty()) return torch::zeros({});
-  const Tensor logits = net.coarseLogits(
-      coarseInputs(scene, visible, targets, net.config.coarse_empty_tokens), s.condition.frame);
-  const Tensor p = logits.detach().sigmoid().contiguous();
-  for (size_t i = 0; i < targets.size(); ++i) (*gate)[targets[i]] = p.data_ptr<float>()[i];
-  return occupancyLoss(logits, labelsOf(targets, s.target_coarse, net.config.unobserved_weight),
-                       net.config);
-}
-
 std::vector<Coord> nearestOf(const std::vector<Coord>& from, const Eigen::Vector3d& centre, int64_t n) {
   std::vector<Coord> chosen;
   for (int64_t row : nearestRows(from, centre, n)) chosen.push_back(from[size_t(row)]);
   return chosen;
+}
+
+// The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities there.
+Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s,
+                  torch::Generator& random, std::map<Coord, float>* gate) {
+  for (const Coord& c : scene.coarse_filled) (*gate)[c] = 1;
+  CoarseMask mask = drawCoarseMask(scene.coarse_unknown, s.target_coarse, random);
+  for (const Coord& c : mask.visible) (*gate)[c] = 1;
+  if (mask.targets.empty()) return torch::zeros({});
+  // Inference asks in chunks of neighbours; so does training.
+  const Coord around = mask.targets[size_t(torch::randint(int64_t(mask.targets.size()), {1}, random).item<int64_t>())];
+  const std::vector<Coord> targets = nearestOf(mask.targets, {double(around.x()), double(around.y()), double(around.z())},
+                                               net.config.coarse_chunk_tokens);
+  const Tensor logits = net.coarseLogits(
+      coarseInputs(scene, mask.visible, targets, net.config.coarse_empty_tokens), s.condition.frame);
+  const Tensor p = logits.detach().sigmoid().contiguous();
+  for (size_t i = 0; i < targets.size(); ++i) (*gate)[targets[i]] = p.data_ptr<float>()[i];
+  // Positions not worked on get the probability that a middling coarse stage would give them, so that the
+  // fine stage sees whole neighbourhoods.
+  const Tensor draws = torch::rand({int64_t(scene.coarse_unknown.size()), 2}, random);
+  for (size_t i = 0; i < scene.coarse_unknown.size(); ++i) {
+    const float* d = draws.data_ptr<float>() + 2 * i;
+    if (s.target_coarse.at(scene.coarse_unknown[i]) == NodeState::kFilled) {
+      gate->emplace(scene.coarse_unknown[i], .3f + .7f * d[0]);
+    } else if (d[1] < .08f) {
+      gate->emplace(scene.coarse_unknown[i], .05f + .45f * d[0]);
+    }
+  }
+  return occupancyLoss(logits, labelsOf(targets, s.target_coarse, net.config.unobserved_weight),
+                       net.config);
 }
 
 Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generator& random) {
@@ -234,7 +249,10 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generat
   };
   const auto latent = latentLoss(*net.diffusion, f.targets, targets);
   l.linear = latent.linear, l.diffusion = latent.diffusion;
-  const auto refined = latentLoss(*net.refinement, f.conditions.detach(), in[kCondition].coords);
+  // A fraction of the condition tokens is enough for a head that no other part learns from.
+  const std::vector<Coord> some(in[kCondition].coords.begin(),
+                                in[kCondition].coords.begin() + std::ptrdiff_t(std::min<size_t>(64, in[kCondition].coords.size())));
+  const auto refined = latentLoss(*net.refinement, f.conditions.slice(0, 0, int64_t(some.size())).detach(), some);
   l.refinement = refined.linear + .5f * refined.diffusion;
   return l;
 }
