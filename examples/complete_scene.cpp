@@ -1,0 +1,20 @@
+// The main job as a library: complete_scene VIEWS WEIGHTS_FOLDER NAME writes NAME.vdb and its siblings.
+#include <cstdio>
+
+#include "houdini_style_tools/complete.h"
+
+int main(int argc, char** argv) try {
+  if (argc != 4) throw vdbc::UsageError("usage: complete_scene VIEWS WEIGHTS_FOLDER NAME");
+  using namespace vdbc;
+  const std::vector<View> views = readViews(argv[1]);
+  const Encoder encoder(std::string(argv[2]) + "/encoder.safetensors");
+  const Completer completer(std::string(argv[2]) + "/completer.safetensors");
+  SceneSettings settings;
+  settings.volume.up = conventionalUp(argv[1]);
+  Progress silent;
+  const Completion place = completeScene(views, encoder, completer, settings, silent);
+  writeCompletion(views, place, argv[3], settings.volume.up, silent);
+} catch (const std::exception& e) {
+  std::fprintf(stderr, "%s\n", e.what());
+  return 1;
+}
