@@ -79,6 +79,7 @@ Observation observed(const std::vector<View>& views, const VoxelFrame& frame,
                      const EncoderConfig& c) {
   ObservationSettings settings;
   settings.patches_across = c.patches_across;
+  settings.level = c.levels;
   Progress silent;
   return observe(views, frame, settings, silent);
 }

@@ -173,7 +173,8 @@ TEST(FitVolume, HoldsCamerasAndPointsTightlyInWholeCoarseNodes) {
     };
     for (const Vector3d& p : pointsOf(capture)) ASSERT_TRUE(inside(p)) << p.transpose();
     for (const Camera& c : capture.cameras) EXPECT_TRUE(inside(c.world_from_camera.translation()));
-    const Vector3d extent = room.box.sizes() + 2 * Vector3d(1, 1, 0.2);
+    const Vector3d extent = room.box.sizes() + 2 * Vector3d(settings.margin_m, settings.margin_m,
+                                                          settings.vertical_margin_m);
     std::array<int, 3> dims{frame.bounds.dim().x(), frame.bounds.dim().y(), frame.bounds.dim().z()};
     if (std::abs(frame.world_from_grid.linear().col(0).dot(turned.col(0))) < 0.5)
       std::swap(dims[0], dims[1]);
