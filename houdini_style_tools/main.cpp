@@ -34,6 +34,7 @@ struct Complete {
   std::vector<double> up, bounds;
   double margin = VolumeSettings().margin_m;
   double tau = CompleteSettings().tau, coarse_tau = CompleteSettings().coarse_tau;
+  double child_tau = SceneSettings().child_threshold;
   double temperature = 1;
   int sampling_steps = 0;
   bool refine_observed = false;
@@ -99,6 +100,7 @@ SceneSettings sceneSettings(const Complete& o, const Common& common, const Eigen
       throw UsageError("--bounds: expected a box: x0 y0 z0 x1 y1 z1 with each second corner larger");
   }
   s.completion.tau = float(o.tau), s.completion.coarse_tau = float(o.coarse_tau);
+  s.child_threshold = float(o.child_tau);
   s.completion.sampling_steps = o.sampling_steps, s.completion.temperature = o.temperature;
   s.completion.refine_observed = o.refine_observed;
   s.completion.seed = common.seed;
@@ -293,7 +295,7 @@ void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
   constexpr int kValidationRooms = 8;
   const Encoder encoder(t.encoder);
   CompleterConfig config = t.preset == "paper" ? CompleterConfig::paper() : CompleterConfig::small();
-  config.latent_dim = encoder.config().latent_dim;
+  config.latent_dim = encoder.config().latent_dim, config.latent_groups = encoder.config().latent_groups;
   TrainSettings s = trainSettings(t, common);
   s.metadata["trained_on"] = seedRange(kCompleterTrainingSeed, t.scenes);
   s.metadata["validated_on"] = seedRange(kValidationSeed, kValidationRooms);
@@ -336,6 +338,7 @@ void addCompletion(CLI::App* app, Complete* o) {
   app->add_option("--margin", o->margin, "room around what was seen [m]")->check(Between(0, 100))->capture_default_str();
   app->add_option("--tau", o->tau, "a token is kept above this probability")->check(Between(0, 1))->capture_default_str();
   app->add_option("--coarse-tau", o->coarse_tau, "the same for the coarse gate")->check(Between(0, 1))->capture_default_str();
+  app->add_option("--child-tau", o->child_tau, "the same for voxels of a kept token")->check(Between(0, 1))->capture_default_str();
   app->add_option("--sampling-steps", o->sampling_steps, "diffusion steps, 0 = the linear mean")->check(CLI::Range(0, 1000))->capture_default_str();
   app->add_option("--temperature", o->temperature, "of the diffusion head")->check(Between(0, 10))->capture_default_str();
   app->add_flag("--refine-observed", o->refine_observed, "let the completer rewrite observed latents");

@@ -28,6 +28,7 @@ namespace {
 template <typename Config, typename Visit>
 void visitFields(Config& c, Visit&& visit) {
   visit("preset", c.preset), visit("latent_dim", c.latent_dim);
+  visit("latent_groups", c.latent_groups);
   visit("width", c.width), visit("heads", c.heads), visit("layers", c.layers);
   visit("coarse_width", c.coarse_width), visit("coarse_heads", c.coarse_heads);
   visit("coarse_layers", c.coarse_layers);
@@ -60,7 +61,7 @@ CompleterConfig CompleterConfig::fromJson(const std::string& text, const std::st
     require(value >= low && value <= high, "CompleterConfig: ", where, ": expected ", name, " in [",
             low, ", ", high, "], found ", value);
   };
-  within("latent_dim", c.latent_dim, 1, 1024), within("width", c.width, 1, 4096);
+  within("latent_dim", c.latent_dim, 1, 1024), within("latent_groups", c.latent_groups, 1, c.latent_dim), within("width", c.width, 1, 4096);
   within("heads", c.heads, 1, 64), within("layers", c.layers, 1, 64);
   within("coarse_width", c.coarse_width, 1, 4096), within("coarse_heads", c.coarse_heads, 1, 64);
   within("coarse_layers", c.coarse_layers, 1, 64);
@@ -70,8 +71,8 @@ CompleterConfig CompleterConfig::fromJson(const std::string& text, const std::st
   within("empty_tokens", c.empty_tokens, 0, 1 << 20), within("chunk_tokens", c.chunk_tokens, 1, 1 << 20);
   within("coarse_empty_tokens", c.coarse_empty_tokens, 1, 1 << 20);
   within("coarse_chunk_tokens", c.coarse_chunk_tokens, 1, 1 << 20);
-  require(c.width % (2 * c.heads) == 0 && c.coarse_width % (2 * c.coarse_heads) == 0,
-          "CompleterConfig: ", where, ": widths are not multiples of twice their heads");
+  require(c.latent_dim % c.latent_groups == 0 && c.width % (2 * c.heads) == 0 && c.coarse_width % (2 * c.coarse_heads) == 0,
+          "CompleterConfig: ", where, ": widths are not multiples of twice their heads, or the latents of their groups");
   return c;
 }
 
@@ -153,7 +154,7 @@ struct Completer::Impl {
     in[kTarget].features = torch::tensor(parent_probability).unsqueeze(1);
     const CompleterNet::Fine f = net->fine(in, frame);
     return {f.logits.sigmoid(),
-            net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random)};
+            net->project(net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random))};
   }
 
   // Visits candidates level by level; keeps those that `keep` accepts given their probability.
@@ -229,7 +230,7 @@ struct Completer::Impl {
         in[kEmptyToken].coords.push_back(scene.empty_shell[size_t(row)]);
       in[kTarget].features = torch::zeros({0, 1});
       const CompleterNet::Fine f = net->fine(in, frame);
-      g->z.index_copy_(0, rows, net->refinement->sample(f.conditions, s.sampling_steps, s.temperature, random));
+      g->z.index_copy_(0, rows, net->project(net->refinement->sample(f.conditions, s.sampling_steps, s.temperature, random)));
     }
   }
 

@@ -12,7 +12,7 @@ namespace vdbc {
 /// Every size of the completer; saved inside the weights file.
 struct CompleterConfig {
   std::string preset = "small";
-  int latent_dim = 32;
+  int latent_dim = 32, latent_groups = 8;               // as the encoder's (spec E10)
   int width = 128, heads = 4, layers = 3;               // fine stage; layers each in H1 and H2
   int coarse_width = 96, coarse_heads = 3, coarse_layers = 2;  // coarse stage, one tree level up
   int diffusion_width = 256, diffusion_steps = 1000, diffusion_draws = 2;
