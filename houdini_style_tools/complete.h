@@ -14,7 +14,7 @@ struct SceneSettings {
   VolumeSettings volume;          // voxel size comes from the encoder's weights
   CarveSettings carving;
   CompleteSettings completion;
-  float child_threshold = .5f;    // of BCE-up, for voxels that were not observed
+  float child_threshold = .05f;   // of BCE-up, for voxels that were not observed
 };
 
 /// A completed place, before it is written.
