@@ -1,6 +1,6 @@
 #!/bin/sh
 # Makes every figure that README and docs quote: evaluation on held-out rooms and on a real capture, and the
-# README's picture. Results in docs/results/. Takes about a quarter of an hour on two cores.
+# README's picture. Results in docs/results/. Takes about five minutes on two cores.
 #   sh examples/figures.sh [FOLDER with rgbd_redkitchen, default ../shared/data]
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
@@ -8,14 +8,15 @@ data=${1:-$root/../shared/data}
 program=$root/build/release/vdb_complete
 results=$root/docs/results
 mkdir -p "$results" "$root/out"
+: >"$root/out/figures.log"
 
-"$program" eval --scenes rooms:1-32 --views 2 --json 2>/dev/null >"$results/rooms_2_views.jsonl"
-"$program" "$root/examples/two_views" -o "$root/out/two_views.vdb" --json 2>/dev/null >"$results/two_views.json"
+"$program" eval --scenes rooms:1-32 --views 2 --json 2>>"$root/out/figures.log" >"$results/rooms_2_views.jsonl"
+"$program" "$root/examples/two_views" -o "$root/out/two_views.vdb" --json 2>>"$root/out/figures.log" >"$results/two_views.json"
 cp "$root/out/two_views.png" "$root/docs/two_views.png"
 if [ -d "$data/rgbd_redkitchen" ]; then
-  "$program" "$data/rgbd_redkitchen" --frames 0,6,12,18 -o "$root/out/redkitchen.vdb" --json 2>/dev/null \
+  "$program" "$data/rgbd_redkitchen" --frames 0,6,12,18 -o "$root/out/redkitchen.vdb" --json 2>>"$root/out/figures.log" \
     >"$results/redkitchen_4_views.json"
-  "$program" eval --scenes "$data/rgbd_redkitchen" --frames 0,6,12,18 --json 2>/dev/null \
+  "$program" eval --scenes "$data/rgbd_redkitchen" --frames 0,6,12,18 --json 2>>"$root/out/figures.log" \
     >"$results/redkitchen_eval.jsonl"
 fi
 grep -h '"mean"' "$results"/*.jsonl

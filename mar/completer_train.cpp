@@ -273,11 +273,14 @@ void fitLatentScale(CompleterNet& net, const SampleSource& samples, int64_t coun
 std::map<std::string, double> validate(const std::string& weights, const std::vector<CompletionSample>& samples,
                                        const std::vector<ObservedSpace>& spaces) {
   const Completer completer(weights);
+  // Fixed, so that logs compare whatever the program's defaults are.
+  CompleteSettings settings;
+  settings.tau = .5f, settings.coarse_tau = .1f;
   Progress silent;
   double precision = 0, recall = 0, f1 = 0, error = 0;
   for (size_t i = 0; i < samples.size(); ++i) {
     const CompletionSample& s = samples[i];
-    const LatentGrid whole = completer.complete(s.condition, spaces[i], {}, silent);
+    const LatentGrid whole = completer.complete(s.condition, spaces[i], settings, silent);
     double hit = 0, filled = 0, truth = 0, known = 0, squared = 0, matched = 0;
     for (auto node = s.seen_nodes.box.begin(); node; ++node)
       truth += s.seen_nodes.at(*node) == NodeState::kUnobserved &&
