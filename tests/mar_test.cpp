@@ -101,7 +101,7 @@ ObservedSpace spaceOf(const NodeStates& nodes) {
 
 CompleterConfig toyConfig() {
   CompleterConfig c;
-  c.preset = "toy", c.latent_dim = kDim;
+  c.preset = "toy", c.latent_dim = kDim, c.latent_groups = kDim / 4;
   c.width = 24, c.heads = 2, c.layers = 2, c.coarse_width = 16, c.coarse_heads = 1;
   c.diffusion_width = 16, c.diffusion_steps = 100;
   c.context_tokens = 40, c.empty_tokens = 12, c.chunk_tokens = 16, c.coarse_empty_tokens = 8;
