@@ -5,7 +5,7 @@
 #include <fstream>
 #include <nlohmann/json.hpp>
 
-#include "vdb/error.h"
+#include "vdb/file_io.h"
 
 namespace vdbc {
 namespace {
@@ -45,30 +45,19 @@ void writeTensors(const TensorFile& file, const std::string& path) {
   }
   std::string text = header.dump();
   text.resize((text.size() + 7) / 8 * 8, ' ');
-  const std::string temporary = path + ".tmp";
-  {
-    std::ofstream out(temporary, std::ios::binary);
-    require(out.good(), "writeTensors: ", path, ": cannot create the file");
-    const uint64_t length = text.size();
-    out.write(reinterpret_cast<const char*>(&length), 8);
-    out.write(text.data(), std::streamsize(text.size()));
-    for (const auto& entry : file.tensors) {
-      const Tensor t = entry.second.detach().cpu().contiguous();
-      out.write(static_cast<const char*>(t.data_ptr()), std::streamsize(t.nbytes()));
-    }
-    out.flush();
-    if (!out.good()) {
-      out.close();
-      std::remove(temporary.c_str());
-      throw Error(joinText("writeTensors: ", path, ": write failed (disk full?)"));
-    }
+  TemporaryFile target("writeTensors", path);
+  std::ofstream out(target.path(), std::ios::binary);
+  require(out.good(), "writeTensors: ", path, ": cannot create the file");
+  const uint64_t length = text.size();
+  out.write(reinterpret_cast<const char*>(&length), 8);
+  out.write(text.data(), std::streamsize(text.size()));
+  for (const auto& entry : file.tensors) {
+    const Tensor t = entry.second.detach().cpu().contiguous();
+    out.write(static_cast<const char*>(t.data_ptr()), std::streamsize(t.nbytes()));
   }
-  std::error_code error;
-  std::filesystem::rename(temporary, path, error);
-  if (error) {
-    std::remove(temporary.c_str());
-    throw Error(joinText("writeTensors: ", path, ": cannot rename into place: ", error.message()));
-  }
+  out.close();
+  require(out.good(), "writeTensors: ", path, ": write failed (disk full?)");
+  target.commit();
 }
 
 TensorFile readTensors(const std::string& path) {

@@ -12,19 +12,22 @@ namespace vdbc {
 
 namespace fs = std::filesystem;
 
-Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
-                         const Completer& completer, const SceneSettings& settings,
-                         Progress& progress) {
+Observation observeScene(const std::vector<View>& views, const Encoder& encoder,
+                         const SceneSettings& settings, Progress& progress) {
   VolumeSettings volume = settings.volume;
   volume.voxel_m = encoder.config().voxel_m;
   ObservationSettings observing = encoder.observationSettings();
   observing.carving = settings.carving;
   std::vector<DepthView> depth;
   for (const View& v : views) depth.push_back(v.depthView());
+  return observe(views, fitVolume(depth, volume, settings.carving), observing, progress);
+}
 
+Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
+                         const Completer& completer, const SceneSettings& settings,
+                         Progress& progress) {
   progress.start("carve");
-  const VoxelFrame frame = fitVolume(depth, volume, settings.carving);
-  Completion c{observe(views, frame, observing, progress), {}, {}, {}, {}};
+  Completion c{observeScene(views, encoder, settings, progress), {}, {}, {}, {}};
   progress.end();
   progress.start("encode");
   c.seen = encoder.encode(views, c.observation, progress);

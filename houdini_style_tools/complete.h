@@ -24,6 +24,10 @@ struct Completion {
   DecodedGrid seen_decoded, whole_decoded;
 };
 
+/// Fits the volume (voxels as the encoder's weights want them), carves, pools pixels into voxels.
+Observation observeScene(const std::vector<View>& views, const Encoder& encoder,
+                         const SceneSettings& settings, Progress& progress);
+
 /// Carves, encodes, completes, decodes. Observed tokens of `whole` are bit-identical to `seen`.
 Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
                          const Completer& completer, const SceneSettings& settings,

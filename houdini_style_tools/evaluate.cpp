@@ -250,11 +250,7 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   resetPeakMemory();
   start = std::chrono::steady_clock::now();
   {
-    std::vector<DepthView> depth;
-    for (const View& v : scene.input) depth.push_back(v.depthView());
-    VolumeSettings volume = s.volume;
-    volume.voxel_m = encoder.config().voxel_m;
-    const Observation o = observe(scene.input, fitVolume(depth, volume, s.carving), encoder.observationSettings(), progress);
+    const Observation o = observeScene(scene.input, encoder, s, progress);
     encoder.decode(encoder.encode(scene.input, o, progress), o.space, s.child_threshold, progress);
   }
   const double observed_seconds = secondsSince(start);

@@ -227,7 +227,6 @@ void cookEvaluate(const Evaluate& o, const Complete& options, const Common& comm
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
   SceneSettings settings = sceneSettings(options, common, Eigen::Vector3d::UnitZ());
-  settings.volume.voxel_m = encoder.config().voxel_m;
   std::vector<MethodResult> all;
   auto show = [&](const MethodResult& r) {
     if (common.json) {
