@@ -1,6 +1,13 @@
 // rasterize/forward and rasterize/both: the scene of a furnished room, N Gaussians on its surfaces.
+// machine/fma and machine/triad: what two threads can do, measured in the same run, to compare with
+// figures of other machines.
 #include <benchmark/benchmark.h>
+#include <malloc.h>
+#include <tbb/global_control.h>
+#include <tbb/parallel_for.h>
 
+#include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <random>
 #include <string>
@@ -48,51 +55,229 @@ Gaussians roomScene(int n) {
   return g;
 }
 
-/// 70 degrees wide, in a corner at eye height, looking across the room.
+/// The order in which our .points.vdb files hold them: by leaf of 8^3 voxels, then by voxel; voxels
+/// of about 8 Gaussians.
+Gaussians inLeafOrder(const Gaussians& g) {
+  constexpr double kArea = 120;  // m^2, all faces
+  const double voxel = std::sqrt(8 * kArea / double(g.size()));
+  std::vector<std::pair<uint64_t, size_t>> order;
+  for (size_t i = 0; i < size_t(g.size()); ++i) {
+    uint64_t leaf = 0, in_leaf = 0;
+    for (int j = 0; j < 3; ++j) {
+      const uint64_t at = uint64_t(double(g.mean[i][j]) / voxel + 1024);
+      leaf = leaf << 16 | at >> 3, in_leaf = in_leaf << 3 | (at & 7);
+    }
+    order.emplace_back(leaf << 9 | in_leaf, i);
+  }
+  std::sort(order.begin(), order.end());
+  Gaussians out;
+  out.resize(g.size(), 0);
+  for (size_t i = 0; i < order.size(); ++i) {
+    const size_t from = order[i].second;
+    out.mean[i] = g.mean[from], out.log_scale[i] = g.log_scale[from];
+    out.rotation[i] = g.rotation[from], out.opacity_logit[i] = g.opacity_logit[from];
+    for (size_t j = 0; j < 3; ++j) out.sh[3 * i + j] = g.sh[3 * from + j];
+  }
+  return out;
+}
+
+/// 70 degrees wide, in a corner at eye height, looking across the room: 151 k of 300 k Gaussians
+/// are visible, with 52 pairs a pixel at 224 x 224.
 Camera roomCamera(int width, int height) {
   Camera camera;
   camera.width = width, camera.height = height;
   camera.fx = camera.fy = 0.5 * width / std::tan(35 * M_PI / 180);
   camera.cx = 0.5 * width, camera.cy = 0.5 * height;
-  const Eigen::Vector3d eye(2.6, 2, 1.5), forward = Eigen::Vector3d(-1, 1.6, -0.3).normalized();
+  const Eigen::Vector3d eye(0.3, 0.18, 1.35),
+      forward = Eigen::Vector3d(0.67, 0.74, 0.07).normalized();
   const Eigen::Vector3d right = forward.cross(Eigen::Vector3d::UnitZ()).normalized();
   camera.world_from_camera.linear() << right, forward.cross(right), forward;
   camera.world_from_camera.translation() = eye;
   return camera;
 }
 
-void forward(benchmark::State& state, int n, int width, int height) {
-  const Gaussians g = roomScene(n);
-  const Camera camera = roomCamera(width, height);
-  for (auto _ : state)
-    benchmark::DoNotOptimize(rasterize(g, camera, RasterSettings()).colour.data.data());
+// --- machine
+// -------------------------------------------------------------------------------------
+
+constexpr int kThreads = 2;  // as the figures to compare with
+
+double seconds() {
+  return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
 
-void both(benchmark::State& state, int n, int width, int height) {
-  const Gaussians g = roomScene(n);
-  const Camera camera = roomCamera(width, height);
-  const Image d_colour(width, height, 3, 1.f / float(width * height));
-  for (auto _ : state) {
-    RasterStatePtr saved;
-    benchmark::DoNotOptimize(rasterize(g, camera, RasterSettings(), &saved).colour.data.data());
-    benchmark::DoNotOptimize(rasterizeBackward(g, camera, *saved, d_colour).mean.data());
+/// 2 * 16 * 12 floating-point operations a round, twelve independent chains.
+typedef float Vector __attribute__((vector_size(64)));
+#if defined(__x86_64__)
+#define VDBC_WIDE __attribute__((target("avx512f")))
+#define VDBC_NARROW __attribute__((target("avx2,fma")))
+bool wide() { return __builtin_cpu_supports("avx512f"); }
+#else
+#define VDBC_WIDE
+#define VDBC_NARROW
+bool wide() { return true; }
+#endif
+#define VDBC_FMA_CHAINS                                                                  \
+  Vector v[12] = {};                                                                     \
+  for (int64_t i = 0; i < rounds; ++i)                                                   \
+    _Pragma("GCC unroll 12") for (int k = 0; k < 12; ++k) v[k] = v[k] * 0.999f + 0.001f; \
+  float sum = 0;                                                                         \
+  _Pragma("GCC unroll 12") for (int k = 0; k < 12; ++k) sum += v[k][0];                  \
+  return sum;
+VDBC_WIDE float fmaWide(int64_t rounds){VDBC_FMA_CHAINS} VDBC_NARROW
+    float fmaNarrow(int64_t rounds) {
+  VDBC_FMA_CHAINS
+}
+
+template <typename Work>
+double bestSeconds(int tries, Work work) {
+  double best = 1e9;
+  for (int k = 0; k < tries; ++k) {
+    const double start = seconds();
+    tbb::parallel_for(0, kThreads, work, tbb::static_partitioner());
+    best = std::min(best, seconds() - start);
   }
+  return best;
+}
+
+struct Machine {
+  double fma_gflops, triad_gbs;
+};
+/// Measured once a run.
+const Machine& machine() {
+  static const Machine measured = [] {
+    constexpr int64_t kRounds = 2000000, kCount = 1 << 24;
+    const double fma_s = bestSeconds(
+        5, [](int) { benchmark::DoNotOptimize(wide() ? fmaWide(kRounds) : fmaNarrow(kRounds)); });
+    std::vector<float> a(kCount), b(kCount, 1.f), c(kCount, 2.f);
+    const double triad_s = bestSeconds(8, [&](int thread) {
+      const int64_t end = kCount * (thread + 1) / kThreads;
+      for (int64_t i = kCount * thread / kThreads; i < end; ++i)
+        a[size_t(i)] = b[size_t(i)] + 3.f * c[size_t(i)];
+      benchmark::ClobberMemory();
+    });
+    return Machine{kThreads * 2. * 16 * 12 * double(kRounds) / fma_s / 1e9,
+                   3. * 4 * double(kCount) / triad_s / 1e9};
+  }();
+  return measured;
+}
+
+void machineRate(benchmark::State& state, double Machine::*rate, const char* unit) {
+  for (auto _ : state) benchmark::DoNotOptimize(machine().*rate);
+  state.counters[unit] = machine().*rate;
+}
+
+// --- rows
+// ----------------------------------------------------------------------------------------
+
+/// ../shared/perf.md's probe: ms on two cores with 332 GFLOP/s and 22 GB/s; 0 where it has no
+/// figure.
+struct Row {
+  int n, width, height;
+  double probe_forward, probe_both;
+};
+constexpr double kProbeGflops = 332, kProbeGbs = 22;
+constexpr Row kRows[] = {{20000, 224, 224, 1.15, 2.4},   {100000, 224, 224, 4.0, 9.0},
+                         {300000, 224, 224, 10.8, 18.7}, {650000, 224, 224, 21.1, 39.7},
+                         {20000, 640, 480, 0, 0},        {100000, 640, 480, 9.1, 21.3},
+                         {300000, 640, 480, 18.9, 45.5}, {650000, 640, 480, 0, 0}};
+
+/// Bytes that must move and floating-point operations, from the counts: what each loop reads,
+/// writes and computes for one item; caches are not counted on.
+struct Cost {
+  double bytes, flops;
+};
+Cost costOf(const RasterWork& w, const Row& row, bool both) {
+  const double n = row.n, visible = double(w.visible), instances = double(w.instances),
+               blocks = double(w.blocks), pixels = double(row.width) * row.height;
+  Cost c;
+  // Cull; project; bin; sort; block masks; blend.
+  c.bytes =
+      24 * n + (32 + 80) * visible + 8 * instances + 12 * instances + 66 * instances + 20 * pixels;
+  c.flops = 60 * n + 330 * visible + 230 * instances + 16 * 36 * blocks;
+  if (!both) return c;
+  // Replay and row sums; gather and the chain rule; gradients.
+  c.bytes += 20 * pixels * 2 + 64 * instances + 2 * (64 + 4) * instances + 56 * visible + 56 * n;
+  c.flops += 16 * 70 * blocks + 16 * instances + 330 * visible + 400 * visible;
+  return c;
+}
+
+void run(benchmark::State& state, const Row& row, bool both, bool everything) {
+  tbb::global_control limit(tbb::global_control::max_allowed_parallelism, kThreads);
+  const Gaussians g = inLeafOrder(roomScene(row.n));
+  const Camera camera = roomCamera(row.width, row.height);
+  const float scale = 1.f / float(row.width * row.height);
+  const Image d_colour(row.width, row.height, 3, scale), d_one(row.width, row.height, 1, scale),
+      d_channels(row.width, row.height, 4, scale);
+  const std::vector<float> channels(size_t(row.n) * 4, 0.5f);
+  RasterSettings settings;
+  BackwardExtras extras;
+  if (everything) {
+    settings.median_depth = settings.antialias = true;
+    extras.extra = {4, channels.data()};
+    extras.d_channels = &d_channels, extras.d_median_depth = &d_one, extras.camera = true;
+  }
+  std::vector<double> times;
+  for (auto _ : state) {
+    const double start = seconds();
+    {
+      RasterStatePtr saved;
+      benchmark::DoNotOptimize(
+          rasterize(g, camera, settings, both ? &saved : nullptr, extras.extra).colour.data.data());
+      if (both)
+        benchmark::DoNotOptimize(rasterizeBackward(g, camera, *saved, d_colour,
+                                                   everything ? &d_one : nullptr,
+                                                   everything ? &d_one : nullptr, extras)
+                                     .mean.data());
+    }
+    times.push_back(seconds() - start);
+  }
+  std::sort(times.begin(), times.end());
+  const double ms = 1e3 * times[times.size() / 2];
+  RasterStatePtr saved;
+  rasterize(g, camera, settings, &saved);
+  const RasterWork work = workOf(*saved);
+  const auto rounded = [](double x) { return std::round(x * 1000) / 1000; };
+  state.counters["median_ms"] = rounded(ms);
+  state.counters["min_ms"] = rounded(1e3 * times.front());
+  state.counters["visible"] = double(work.visible);
+  state.counters["instances"] = double(work.instances);
+  state.counters["blocks"] = double(work.blocks);
+  state.counters["pairs_per_pixel"] = rounded(double(work.pairs) / (row.width * row.height));
+  if (everything) return;
+  const Cost cost = costOf(work, row, both);
+  const double floor_ms =
+      std::max(cost.bytes / machine().triad_gbs, cost.flops / machine().fma_gflops) / 1e6;
+  state.counters["MB"] = rounded(cost.bytes / 1e6);
+  state.counters["MFLOP"] = rounded(cost.flops / 1e6);
+  state.counters["share_of_floor"] = rounded(floor_ms / ms);
+  const double probe = both ? row.probe_both : row.probe_forward;
+  if (probe == 0) return;
+  // Scaled by whichever rate leaves the probe the shorter time.
+  const double probe_ms =
+      probe * std::min(kProbeGflops / machine().fma_gflops, kProbeGbs / machine().triad_gbs);
+  state.counters["probe_ms"] = rounded(probe_ms);
+  state.counters["ratio"] = rounded(ms / probe_ms);  // the gate: at most 1
 }
 
 [[maybe_unused]] const bool kRegistered = [] {
-  const int sizes[][2] = {{224, 224}, {640, 480}};
-  for (const auto& [width, height] : sizes)
-    for (int n : {20000, 100000, 300000, 650000}) {
-      const std::string suffix =
-          "/" + std::to_string(n) + "/" + std::to_string(width) + "x" + std::to_string(height);
-      const int w = width, h = height;
-      benchmark::RegisterBenchmark(("rasterize/forward" + suffix).c_str(), forward, n, w, h)
-          ->Unit(benchmark::kMillisecond)
-          ->UseRealTime();
-      benchmark::RegisterBenchmark(("rasterize/both" + suffix).c_str(), both, n, w, h)
-          ->Unit(benchmark::kMillisecond)
-          ->UseRealTime();
-    }
+  mallopt(M_MMAP_THRESHOLD, 1 << 30);  // as the program does: freed pages are kept
+  mallopt(M_TRIM_THRESHOLD, 1 << 30);
+  benchmark::RegisterBenchmark("machine/fma", machineRate, &Machine::fma_gflops, "GFLOP/s")
+      ->Iterations(1);
+  benchmark::RegisterBenchmark("machine/triad", machineRate, &Machine::triad_gbs, "GB/s")
+      ->Iterations(1);
+  const auto add = [](const char* name, const Row& row, bool both, bool everything) {
+    const std::string full = std::string("rasterize/") + name + "/" + std::to_string(row.n) + "/" +
+                             std::to_string(row.width) + "x" + std::to_string(row.height);
+    benchmark::RegisterBenchmark(full.c_str(), run, row, both, everything)
+        ->Unit(benchmark::kMillisecond)
+        ->UseRealTime();
+  };
+  for (const Row& row : kRows) {
+    add("forward", row, false, false);
+    add("both", row, true, false);
+  }
+  add("everything", kRows[2], true, true);  // four channels, all outputs, all gradients
   return true;
 }();
 

@@ -22,14 +22,16 @@ namespace {
 // -------------------------------------------------------------------------------------
 
 /// All parameters of a scene in double precision, by array: mean, log_scale, rotation,
-/// opacity_logit, sh.
+/// opacity_logit, sh, extra channels, camera twist (rotation, translation).
+constexpr int kArrays = 7;
 struct Parameters {
-  int n = 0, sh_degree = 0;
-  std::vector<double> arrays[5];
+  int n = 0, sh_degree = 0, channels = 0;
+  std::vector<double> arrays[kArrays];
 };
-const char* const kArrayNames[5] = {"mean", "log_scale", "rotation", "opacity_logit", "sh"};
+const char* const kArrayNames[kArrays] = {"mean", "log_scale", "rotation", "opacity_logit",
+                                          "sh",   "extra",     "camera"};
 
-Parameters parametersOf(const Gaussians& g) {
+Parameters parametersOf(const Gaussians& g, const ExtraChannels& extra = {}) {
   Parameters p;
   p.n = int(g.size()), p.sh_degree = g.sh_degree;
   for (int i = 0; i < p.n; ++i) {
@@ -39,6 +41,9 @@ Parameters parametersOf(const Gaussians& g) {
     p.arrays[3].push_back(double(g.opacity_logit[size_t(i)]));
   }
   p.arrays[4].assign(g.sh.begin(), g.sh.end());
+  p.channels = extra.count;
+  p.arrays[5].assign(extra.values, extra.values + g.size() * extra.count);
+  p.arrays[6].assign(6, 0.);
   return p;
 }
 
@@ -67,13 +72,20 @@ std::vector<double> referenceBasis(int degree, const Eigen::Vector3d& d) {
 }
 
 struct ReferenceImage {
-  std::vector<double> values;  // [H, W, 5]: colour, alpha, depth
+  std::vector<double> values;  // [H, W, 6 + C]: colour, alpha, depth, median depth, extra channels
 };
 
 /// Every pixel asks every Gaussian, in order of depth.
-ReferenceImage renderReference(const Parameters& p, const Camera& camera,
+ReferenceImage renderReference(const Parameters& p, const Camera& unmoved,
                                const RasterSettings& settings) {
+  Camera camera = unmoved;
+  const Eigen::Vector3d turn(p.arrays[6][0], p.arrays[6][1], p.arrays[6][2]);
+  camera.world_from_camera.translate(
+      Eigen::Vector3d(p.arrays[6][3], p.arrays[6][4], p.arrays[6][5]));
+  if (turn.norm() > 0)
+    camera.world_from_camera.rotate(Eigen::AngleAxisd(turn.norm(), turn.normalized()));
   struct Spot {
+    int index;
     double u, v, z, opacity;
     Eigen::Matrix2d inverse;
     Eigen::Vector3d colour;
@@ -99,13 +111,15 @@ ReferenceImage renderReference(const Parameters& p, const Camera& camera,
     jacobian << camera.fx / t.z(), 0, -camera.fx * xc / t.z(), 0, camera.fy / t.z(),
         -camera.fy * yc / t.z();
     const Eigen::Matrix<double, 2, 3> a = jacobian * world.transpose();
-    const Eigen::Matrix2d cov =
-        a * covariance * a.transpose() + double(settings.low_pass) * Eigen::Matrix2d::Identity();
+    const Eigen::Matrix2d sharp = a * covariance * a.transpose();
+    const Eigen::Matrix2d cov = sharp + double(settings.low_pass) * Eigen::Matrix2d::Identity();
     Spot spot;
+    spot.index = i;
     spot.u = camera.fx * t.x() / t.z() + camera.cx;
     spot.v = camera.fy * t.y() / t.z() + camera.cy;
     spot.z = t.z();
     spot.opacity = 1 / (1 + std::exp(-p.arrays[3][size_t(i)]));
+    if (settings.antialias) spot.opacity *= std::sqrt(sharp.determinant() / cov.determinant());
     spot.inverse = cov.inverse();
     const std::vector<double> basis = referenceBasis(p.sh_degree, (mean - eye).normalized());
     for (int c = 0; c < 3; ++c) {
@@ -122,7 +136,8 @@ ReferenceImage renderReference(const Parameters& p, const Camera& camera,
   for (int y = 0; y < camera.height; ++y)
     for (int x = 0; x < camera.width; ++x) {
       Eigen::Vector3d colour = Eigen::Vector3d::Zero();
-      double t = 1, weight = 0, weighted_z = 0;
+      double t = 1, weight = 0, weighted_z = 0, median = 0;
+      std::vector<double> channels(size_t(p.channels), 0.);
       for (const Spot& s : spots) {
         const Eigen::Vector2d d(x + 0.5 - s.u, y + 0.5 - s.v);
         const double alpha = s.opacity * std::exp(-0.5 * d.dot(s.inverse * d));
@@ -130,12 +145,17 @@ ReferenceImage renderReference(const Parameters& p, const Camera& camera,
         const double w = t * std::min(alpha, double(settings.max_alpha));
         colour += w * s.colour;
         weight += w, weighted_z += w * s.z;
+        for (size_t c = 0; c < channels.size(); ++c)
+          channels[c] += w * p.arrays[5][size_t(s.index) * channels.size() + c];
+        if (t > 0.5 && t - w <= 0.5) median = s.z;
         t -= w;
       }
       colour += t * settings.background.cast<double>();
       for (int c = 0; c < 3; ++c) image.values.push_back(colour[c]);
       image.values.push_back(weight);
       image.values.push_back(weight > 0 ? weighted_z / weight : 0);
+      image.values.push_back(median);
+      image.values.insert(image.values.end(), channels.begin(), channels.end());
     }
   return image;
 }
@@ -213,7 +233,8 @@ bool allFinite(const std::vector<Vector>& values) {
 }
 bool allFinite(const GaussianGradients& d) {
   return allFinite(d.mean) && allFinite(d.log_scale) && allFinite(d.rotation) &&
-         allFinite(d.opacity_logit) && allFinite(d.sh);
+         allFinite(d.opacity_logit) && allFinite(d.sh) && allFinite(d.extra) &&
+         d.camera.allFinite();
 }
 
 std::vector<double> flat(const GaussianGradients& d, int array) {
@@ -227,35 +248,50 @@ std::vector<double> flat(const GaussianGradients& d, int array) {
   if (array == 2) take(d.rotation);
   if (array == 3) out.assign(d.opacity_logit.begin(), d.opacity_logit.end());
   if (array == 4) out.assign(d.sh.begin(), d.sh.end());
+  if (array == 5) out.assign(d.extra.begin(), d.extra.end());
+  if (array == 6) out.assign(d.camera.data(), d.camera.data() + 6);
   return out;
 }
 
 // --- against the reference
 // -------------------------------------------------------------------------
 
-void expectImagesAgree(const Gaussians& g, const Camera& camera, const RasterSettings& settings) {
-  const RasterOutput out = rasterize(g, camera, settings);
-  const ReferenceImage truth = renderReference(parametersOf(g), camera, settings);
-  double colour_error = 0, alpha_error = 0, depth_error = 0, covered = 0;
+void expectImagesAgree(const Gaussians& g, const Camera& camera, RasterSettings settings,
+                       double least_cover = 0.3) {
+  constexpr int kChannels = 3;
+  const std::vector<float> values = randomImage(int(g.size()), 1, kChannels, 9).data;
+  const ExtraChannels extra = {kChannels, values.data()};
+  settings.median_depth = true;
+  const RasterOutput out = rasterize(g, camera, settings, nullptr, extra);
+  const ReferenceImage truth = renderReference(parametersOf(g, extra), camera, settings);
+  double colour_error = 0, alpha_error = 0, depth_error = 0, channel_error = 0, covered = 0;
+  int medians_differ = 0;
   for (int y = 0; y < camera.height; ++y)
     for (int x = 0; x < camera.width; ++x) {
-      const double* t = &truth.values[size_t(y * camera.width + x) * 5];
+      const double* t = &truth.values[size_t(y * camera.width + x) * (6 + kChannels)];
       for (int c = 0; c < 3; ++c)
         colour_error = std::max(colour_error, std::abs(double(out.colour.at(x, y, c)) - t[c]));
       alpha_error = std::max(alpha_error, std::abs(double(out.alpha.at(x, y, 0)) - t[3]));
       depth_error = std::max(depth_error, std::abs(double(out.depth.at(x, y, 0)) - t[4]));
+      medians_differ += std::abs(double(out.median_depth.at(x, y, 0)) - t[5]) > 1e-5;
+      for (int c = 0; c < kChannels; ++c)
+        channel_error =
+            std::max(channel_error, std::abs(double(out.channels.at(x, y, c)) - t[6 + c]));
       covered += t[3];
     }
   EXPECT_LT(colour_error, 1e-4);
   EXPECT_LT(alpha_error, 1e-4);
-  EXPECT_LT(depth_error, 3e-4);  // metres; the image ends at 1e-4 transmittance
-  EXPECT_GT(covered, 0.3 * camera.width * camera.height);
+  EXPECT_LT(depth_error, 3e-4);    // metres; the image ends at 1e-4 transmittance
+  EXPECT_LT(channel_error, 3e-4);  // values are up to 4
+  EXPECT_EQ(medians_differ, 0);
+  EXPECT_GE(covered, least_cover * camera.width * camera.height);
 }
 
 TEST(Rasterize, ImageMatchesReference) {
   RasterSettings settings;
   settings.background = {0.2f, 0.5f, 0.9f};
   for (int degree = 0; degree <= 3; ++degree) {
+    settings.antialias = degree % 2;
     const Camera camera = tiltedCamera(75, 53);  // no multiple of a tile
     expectImagesAgree(randomScene(400, degree, camera, unsigned(1 + degree)), camera, settings);
   }
@@ -266,31 +302,45 @@ TEST(Rasterize, DenseImageMatchesReference) {  // many chunks a tile, blocks tha
   expectImagesAgree(randomScene(5000, 0, camera, 5, 0.05), camera, RasterSettings());
 }
 
+enum class Loss { kColour, kAllBuiltIn, kEverything };  // colour; + alpha and depth; + the rest
+
 /// All derivatives of sum(weights * image) against central differences of the reference.
-void expectGradientsAgree(const Gaussians& g, const Camera& camera, const RasterSettings& settings,
-                          bool with_alpha_and_depth) {
+void expectGradientsAgree(const Gaussians& g, const Camera& camera, RasterSettings settings,
+                          Loss what, int channels = 3) {
   const int w = camera.width, h = camera.height;
+  const bool everything = what == Loss::kEverything, built_in = what != Loss::kColour;
+  if (!everything) channels = 0;
+  const std::vector<float> values = randomImage(int(g.size()), 1, channels, 9).data;
+  const ExtraChannels extra = {channels, values.data()};
   const Image d_colour = randomImage(w, h, 3, 11), d_alpha = randomImage(w, h, 1, 12),
-              d_depth = randomImage(w, h, 1, 13);
+              d_depth = randomImage(w, h, 1, 13), d_median = randomImage(w, h, 1, 14),
+              d_channels = randomImage(w, h, channels, 15);
+  settings.median_depth = everything;
   RasterStatePtr state;
-  rasterize(g, camera, settings, &state);
+  rasterize(g, camera, settings, &state, extra);
+  BackwardExtras extras;
+  extras.camera = true;
+  extras.extra = extra;
+  if (everything) extras.d_channels = &d_channels, extras.d_median_depth = &d_median;
   const GaussianGradients d =
-      rasterizeBackward(g, camera, *state, d_colour, with_alpha_and_depth ? &d_alpha : nullptr,
-                        with_alpha_and_depth ? &d_depth : nullptr);
+      rasterizeBackward(g, camera, *state, d_colour, built_in ? &d_alpha : nullptr,
+                        built_in ? &d_depth : nullptr, extras);
+  const size_t stride = size_t(6 + channels);
   const auto loss = [&](const Parameters& p) {
     const ReferenceImage image = renderReference(p, camera, settings);
     double sum = 0;
     for (size_t i = 0; i < d_alpha.data.size(); ++i) {
-      for (size_t c = 0; c < 3; ++c)
-        sum += double(d_colour.data[3 * i + c]) * image.values[5 * i + c];
-      if (!with_alpha_and_depth) continue;
-      sum += double(d_alpha.data[i]) * image.values[5 * i + 3];
-      sum += double(d_depth.data[i]) * image.values[5 * i + 4];
+      const double* pixel = &image.values[stride * i];
+      for (size_t c = 0; c < 3; ++c) sum += double(d_colour.data[3 * i + c]) * pixel[c];
+      if (built_in) sum += double(d_alpha.data[i]) * pixel[3] + double(d_depth.data[i]) * pixel[4];
+      if (everything) sum += double(d_median.data[i]) * pixel[5];
+      for (size_t c = 0; c < size_t(channels); ++c)
+        sum += double(d_channels.data[size_t(channels) * i + c]) * pixel[6 + c];
     }
     return sum;
   };
-  Parameters p = parametersOf(g);
-  for (int array = 0; array < 5; ++array) {
+  Parameters p = parametersOf(g, extra);
+  for (int array = 0; array < kArrays; ++array) {
     const std::vector<double> ours = flat(d, array);
     ASSERT_EQ(ours.size(), p.arrays[array].size());
     std::vector<double> truth(ours.size());
@@ -305,6 +355,7 @@ void expectGradientsAgree(const Gaussians& g, const Camera& camera, const Raster
       value = at;
       square += truth[i] * truth[i];
     }
+    if (ours.empty()) continue;
     const double rms = std::sqrt(square / double(ours.size()));
     EXPECT_GT(rms, 1e-3) << kArrayNames[array];
     for (size_t i = 0; i < ours.size(); ++i)
@@ -317,26 +368,64 @@ TEST(Rasterize, BackwardMatchesFiniteDifferences) {
   const Camera camera = tiltedCamera(35, 28);
   RasterSettings settings;
   settings.background = {0.3f, 0.1f, 0.7f};
-  expectGradientsAgree(randomScene(40, 0, camera, 21), camera, settings, false);
+  expectGradientsAgree(randomScene(40, 0, camera, 21), camera, settings, Loss::kColour);
 }
 
 TEST(Rasterize, BackwardMatchesFiniteDifferencesWithAlphaAndDepth) {
   const Camera camera = tiltedCamera(35, 28);
-  expectGradientsAgree(randomScene(40, 0, camera, 22), camera, RasterSettings(), true);
+  expectGradientsAgree(randomScene(40, 0, camera, 22), camera, RasterSettings(), Loss::kAllBuiltIn);
 }
 
 TEST(Rasterize, BackwardMatchesFiniteDifferencesForEverySphericalHarmonic) {
   const Camera camera = tiltedCamera(20, 18);
   for (int degree = 1; degree <= 3; ++degree)
     expectGradientsAgree(randomScene(14, degree, camera, unsigned(30 + degree), 0.2), camera,
-                         RasterSettings(), true);
+                         RasterSettings(), Loss::kAllBuiltIn);
+}
+
+TEST(Rasterize, BackwardMatchesFiniteDifferencesWithEveryOutput) {
+  const Camera camera = tiltedCamera(20, 18);
+  RasterSettings settings;
+  settings.background = {0.3f, 0.1f, 0.7f};
+  for (const bool antialias : {false, true})
+    for (const int channels : {0, 1, 5, 19}) {
+      settings.antialias = antialias;
+      expectGradientsAgree(randomScene(14, 3, camera, unsigned(35 + channels), 0.2), camera,
+                           settings, Loss::kEverything, channels);
+    }
+}
+
+TEST(Rasterize, BackwardMatchesFiniteDifferencesWhereTheLowPassDims) {
+  const Camera camera = tiltedCamera(24, 20);  // Gaussians of about a pixel
+  RasterSettings settings;
+  settings.antialias = true;
+  Gaussians g = randomScene(60, 1, camera, 38, 0.04);
+  for (float& logit : g.opacity_logit) logit += 3.f;
+  expectGradientsAgree(g, camera, settings, Loss::kEverything);
+}
+
+TEST(Rasterize, EveryVectorWidthMatchesReference) {
+  const Camera camera = tiltedCamera(27, 22);
+  for (const int bits : {128, 256, 512}) {
+    RasterSettings settings;
+    settings.vector_bits = bits;
+    settings.antialias = true;
+    try {
+      rasterize(Gaussians(), camera, settings);
+    } catch (const Error&) {
+      GTEST_LOG_(INFO) << "this CPU has no registers of " << bits << " bits";
+      continue;
+    }
+    expectImagesAgree(randomScene(1000, 3, camera, 36, 0.08), camera, settings);
+    expectGradientsAgree(randomScene(14, 2, camera, 37, 0.2), camera, settings, Loss::kEverything);
+  }
 }
 
 TEST(Rasterize, NeedlesHaveTheRightGradient) {  // large off-diagonal terms of the conic
   const Camera camera = tiltedCamera(40, 40);
   Gaussians g = randomScene(12, 0, camera, 41);
   for (auto& s : g.log_scale) s = {std::log(0.4f), std::log(0.01f), std::log(0.02f)};
-  expectGradientsAgree(g, camera, RasterSettings(), true);
+  expectGradientsAgree(g, camera, RasterSettings(), Loss::kEverything);
 }
 
 // --- closed forms
@@ -451,28 +540,165 @@ bool sameBytes(const std::vector<float>& a, const std::vector<float>& b) {
   return a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * 4) == 0;
 }
 
+/// Every output and gradient of one scene, everything asked for.
+struct Everything {
+  RasterOutput out;
+  GaussianGradients d;
+};
+Everything runEverything(const Gaussians& g, const Camera& camera, int channels = 3,
+                         int vector_bits = 0) {
+  const int w = camera.width, h = camera.height;
+  const std::vector<float> values = randomImage(int(g.size()), 1, channels, 9).data;
+  const Image d_colour = randomImage(w, h, 3, 1), d_depth = randomImage(w, h, 1, 2),
+              d_alpha = randomImage(w, h, 1, 3), d_median = randomImage(w, h, 1, 4),
+              d_channels = randomImage(w, h, channels, 5);
+  RasterSettings settings;
+  settings.median_depth = settings.antialias = true;
+  settings.vector_bits = vector_bits;
+  RasterStatePtr state;
+  BackwardExtras extras;
+  extras.extra = {channels, values.data()};
+  extras.d_channels = &d_channels, extras.d_median_depth = &d_median, extras.camera = true;
+  Everything all;
+  all.out = rasterize(g, camera, settings, &state, extras.extra);
+  all.d = rasterizeBackward(g, camera, *state, d_colour, &d_alpha, &d_depth, extras);
+  return all;
+}
+bool allFinite(const RasterOutput& out) {
+  return allFinite(out.colour.data) && allFinite(out.alpha.data) && allFinite(out.depth.data) &&
+         allFinite(out.median_depth.data) && allFinite(out.channels.data);
+}
+
 TEST(Rasterize, SameBytesForAnyNumberOfThreads) {
   const Camera camera = tiltedCamera(150, 110);
   const Gaussians g = randomScene(30000, 1, camera, 61, 0.03);
-  const Image d_colour = randomImage(150, 110, 3, 1), d_depth = randomImage(150, 110, 1, 2);
   const auto run = [&](size_t threads) {
     tbb::global_control limit(tbb::global_control::max_allowed_parallelism, threads);
-    RasterStatePtr state;
-    RasterOutput out = rasterize(g, camera, RasterSettings(), &state);
-    return std::make_pair(std::move(out),
-                          rasterizeBackward(g, camera, *state, d_colour, nullptr, &d_depth));
+    return runEverything(g, camera);
   };
-  const auto [one, d_one] = run(1);
-  for (size_t threads : {2, 5}) {
-    const auto [many, d_many] = run(threads);
-    EXPECT_TRUE(sameBytes(one.colour.data, many.colour.data));
-    EXPECT_TRUE(sameBytes(one.alpha.data, many.alpha.data));
-    EXPECT_TRUE(sameBytes(one.depth.data, many.depth.data));
-    EXPECT_EQ(d_one.mean, d_many.mean);
-    EXPECT_EQ(d_one.log_scale, d_many.log_scale);
-    EXPECT_EQ(d_one.rotation, d_many.rotation);
-    EXPECT_TRUE(sameBytes(d_one.opacity_logit, d_many.opacity_logit));
-    EXPECT_TRUE(sameBytes(d_one.sh, d_many.sh));
+  const Everything one = run(1);
+  for (size_t threads : {2, 3, 5}) {
+    const Everything many = run(threads);
+    EXPECT_TRUE(sameBytes(one.out.colour.data, many.out.colour.data));
+    EXPECT_TRUE(sameBytes(one.out.alpha.data, many.out.alpha.data));
+    EXPECT_TRUE(sameBytes(one.out.depth.data, many.out.depth.data));
+    EXPECT_TRUE(sameBytes(one.out.median_depth.data, many.out.median_depth.data));
+    EXPECT_TRUE(sameBytes(one.out.channels.data, many.out.channels.data));
+    EXPECT_EQ(one.d.mean, many.d.mean);
+    EXPECT_EQ(one.d.log_scale, many.d.log_scale);
+    EXPECT_EQ(one.d.rotation, many.d.rotation);
+    EXPECT_TRUE(sameBytes(one.d.opacity_logit, many.d.opacity_logit));
+    EXPECT_TRUE(sameBytes(one.d.sh, many.d.sh));
+    EXPECT_TRUE(sameBytes(one.d.extra, many.d.extra));
+    EXPECT_EQ(one.d.camera, many.d.camera);
+  }
+}
+
+TEST(Rasterize, MoreOutputsDoNotChangeTheOthers) {
+  const Camera camera = tiltedCamera(60, 50);
+  const Gaussians g = randomScene(2000, 1, camera, 63);
+  RasterSettings settings;
+  const RasterOutput plain = rasterize(g, camera, settings);
+  EXPECT_TRUE(plain.median_depth.data.empty() && plain.channels.data.empty());
+  settings.median_depth = true;
+  const std::vector<float> ones(size_t(g.size()), 1.f);
+  const RasterOutput more = rasterize(g, camera, settings, nullptr, {1, ones.data()});
+  EXPECT_TRUE(sameBytes(plain.colour.data, more.colour.data));
+  EXPECT_TRUE(sameBytes(plain.depth.data, more.depth.data));
+  EXPECT_TRUE(sameBytes(plain.alpha.data, more.channels.data));  // ones blend to alpha
+  for (size_t i = 0; i < plain.alpha.data.size(); ++i) {
+    if (std::abs(plain.alpha.data[i] - 0.5f) < 1e-5f) continue;
+    EXPECT_EQ(more.median_depth.data[i] > 0, plain.alpha.data[i] > 0.5f);
+  }
+}
+
+TEST(Rasterize, DepthOrderSurvivesEveryListLength) {  // the sort changes its way with the length
+  const Camera camera = tiltedCamera(16, 16);
+  for (int n : {1, 2, 63, 64, 65, 3000}) {
+    Gaussians g = randomScene(n, 0, camera, 64, 0.3);
+    for (float& logit : g.opacity_logit) logit = -3.f;
+    if (n > 100)  // most at almost one depth, one much nearer: leading bits alone do not tell
+      for (size_t i = 1; i < size_t(n); ++i)
+        g.mean[i] = camera.unproject(8, 8, 3 + 1e-6 * double((i * 7919) % size_t(n))).cast<float>();
+    expectImagesAgree(g, camera, RasterSettings(), 0);
+  }
+}
+
+TEST(Rasterize, EveryImageSize) {
+  for (const auto& [w, h] :
+       {std::pair{1, 1}, {1, 300}, {300, 1}, {17, 15}, {8192, 3}, {8192, 8192}}) {
+    const Camera camera = tiltedCamera(w, h);
+    Gaussians g = randomScene(40, 0, camera, 65);
+    const bool large = w * h > 1 << 20;
+    RasterStatePtr state;
+    const RasterOutput out = rasterize(g, camera, RasterSettings(), &state);
+    EXPECT_TRUE(allFinite(out));
+    EXPECT_EQ(out.colour.data.size(), size_t(w) * size_t(h) * 3);
+    EXPECT_TRUE(allFinite(rasterizeBackward(g, camera, *state, Image(w, h, 3, 1.f))));
+    if (!large) {
+      EXPECT_TRUE(allFinite(runEverything(g, camera).d));
+    }
+  }
+}
+
+TEST(Rasterize, VectorWidthsAgree) {
+  const Camera camera = tiltedCamera(90, 70);
+  const Gaussians g = randomScene(3000, 3, camera, 66, 0.06);
+  const Everything truth = runEverything(g, camera, 3, 128);
+  for (const int bits : {256, 512}) {
+    Everything other;
+    try {
+      other = runEverything(g, camera, 3, bits);
+    } catch (const Error&) {
+      continue;  // not on this CPU
+    }
+    const auto worst = [](const std::vector<float>& a, const std::vector<float>& b) {
+      double error = 0, square = 0;
+      for (size_t i = 0; i < a.size(); ++i) {
+        error = std::max(error, std::abs(double(a[i]) - double(b[i])));
+        square += double(a[i]) * double(a[i]);
+      }
+      return error / std::sqrt(square / double(a.size()));
+    };
+    EXPECT_LT(worst(truth.out.colour.data, other.out.colour.data), 1e-4) << bits;
+    EXPECT_LT(worst(truth.out.alpha.data, other.out.alpha.data), 1e-4) << bits;
+    EXPECT_LT(worst(truth.out.channels.data, other.out.channels.data), 1e-4) << bits;
+    EXPECT_LT((truth.d.camera - other.d.camera).norm(), 1e-3 * truth.d.camera.norm()) << bits;
+    EXPECT_LT(worst(truth.d.sh, other.d.sh), 0.01) << bits;  // a pixel may cross min_alpha
+    EXPECT_LT(worst(truth.d.extra, other.d.extra), 0.01) << bits;
+  }
+  EXPECT_THROW(runEverything(g, camera, 3, 64), Error);
+}
+
+TEST(Rasterize, OpacityOneIsOpaque) {
+  const Camera camera = centredCamera();
+  Gaussians g;
+  addOnAxis(&g, 1, 0.2, 0.5, {1, 1, 1});
+  g.opacity_logit[0] = std::numeric_limits<float>::infinity();
+  const Everything all = runEverything(g, camera);
+  EXPECT_NEAR(all.out.alpha.at(20, 20, 0), 0.99f, 1e-4f);
+  EXPECT_TRUE(allFinite(all.d));
+  EXPECT_EQ(all.d.opacity_logit[0], 0.f);
+}
+
+TEST(Rasterize, AntialiasingKeepsTheLightOfThinGaussians) {
+  // A Gaussian much smaller than a pixel: the low-pass alone would show it as wide as
+  // sqrt(low_pass) whatever its size; compensated, its summed alpha goes with its area.
+  const Camera camera = centredCamera();
+  RasterSettings settings;
+  settings.antialias = true;
+  settings.min_alpha = 1e-6f;
+  for (const double sigma : {0.002, 0.004, 0.05}) {
+    Gaussians g;
+    addOnAxis(&g, 2, sigma, 0.6, {1, 1, 1});
+    double sum = 0;
+    for (float a : rasterize(g, camera, settings).alpha.data) sum += double(a);
+    const double variance = std::pow(60 * sigma / 2, 2);
+    // integral of o sqrt(det / det_with) exp(..) = o 2 pi sqrt(det)
+    // sampled at pixel centres, of a kernel no narrower than sigma = sqrt(.3)
+    EXPECT_NEAR(sum, 0.6 * variance / (variance + 0.3) * 2 * M_PI * (variance + 0.3),
+                0.02 * 0.6 * 2 * M_PI * variance * (1 + 0.3))
+        << sigma;
   }
 }
 
@@ -519,13 +745,10 @@ TEST(Rasterize, DegenerateGaussiansContributeNothing) {
     g.opacity_logit[0] = 1.f;
     spoils[k](g);
     append(&g, clean);
-    RasterStatePtr state;
-    const RasterOutput out = rasterize(g, camera, settings, &state);
-    EXPECT_TRUE(sameBytes(out.colour.data, truth.colour.data)) << "case " << k;
-    const Image ones(40, 40, 1, 1.f);
-    const GaussianGradients d =
-        rasterizeBackward(g, camera, *state, Image(40, 40, 3, 1.f), &ones, &ones);
-    EXPECT_TRUE(allFinite(d)) << "case " << k;
+    EXPECT_TRUE(sameBytes(rasterize(g, camera, settings).colour.data, truth.colour.data))
+        << "case " << k;
+    const auto [out, d] = runEverything(g, camera);
+    EXPECT_TRUE(allFinite(out) && allFinite(d)) << "case " << k;
     EXPECT_EQ(d.mean[0], Eigen::Vector3f::Zero()) << "case " << k;
     EXPECT_EQ(d.opacity_logit[0], 0.f) << "case " << k;
   }
@@ -546,10 +769,11 @@ TEST(Rasterize, ExtremeGaussiansStayFinite) {
           more.opacity_logit[i] = logit;
         }
         append(&g, more);
+        const Everything all = runEverything(g, camera);  // antialiased
+        EXPECT_TRUE(allFinite(all.out) && allFinite(all.d))
+            << log_scale << " " << logit << " " << z;
         RasterStatePtr state;
-        const RasterOutput out = rasterize(g, camera, RasterSettings(), &state);
-        EXPECT_TRUE(allFinite(out.colour.data) && allFinite(out.alpha.data) &&
-                    allFinite(out.depth.data));
+        EXPECT_TRUE(allFinite(rasterize(g, camera, RasterSettings(), &state)));
         const Image ones(40, 40, 1, 1.f);
         EXPECT_TRUE(
             allFinite(rasterizeBackward(g, camera, *state, Image(40, 40, 3, 1.f), &ones, &ones)))
@@ -565,7 +789,29 @@ TEST(Rasterize, BrokenLossGivesFiniteGradients) {
   Image d(40, 40, 3, 1.f);
   d.at(20, 20, 1) = std::numeric_limits<float>::quiet_NaN();
   d.at(3, 5, 0) = std::numeric_limits<float>::infinity();
-  EXPECT_TRUE(allFinite(rasterizeBackward(g, camera, *state, d)));
+  BackwardExtras extras;
+  extras.camera = true;
+  EXPECT_TRUE(allFinite(rasterizeBackward(g, camera, *state, d, nullptr, nullptr, extras)));
+}
+
+TEST(Rasterize, GaussiansWithBrokenChannelsContributeNothing) {
+  const Camera camera = tiltedCamera(40, 40);
+  const Gaussians clean = randomScene(50, 0, camera, 75);
+  Gaussians g = clean;
+  append(&g, randomScene(2, 0, camera, 76));
+  std::vector<float> values = randomImage(52, 2, 1, 77).data;
+  values[101] = std::numeric_limits<float>::quiet_NaN();
+  values[102] = std::numeric_limits<float>::infinity();
+  RasterStatePtr state;
+  BackwardExtras extras;
+  extras.extra = {2, values.data()};
+  const RasterOutput out = rasterize(g, camera, RasterSettings(), &state, extras.extra);
+  EXPECT_TRUE(sameBytes(out.colour.data, rasterize(clean, camera, RasterSettings()).colour.data));
+  EXPECT_TRUE(allFinite(out));
+  const Image d_channels(40, 40, 2, 1.f);
+  extras.d_channels = &d_channels;
+  EXPECT_TRUE(allFinite(
+      rasterizeBackward(g, camera, *state, Image(40, 40, 3, 1.f), nullptr, nullptr, extras)));
 }
 
 TEST(Rasterize, MismatchesThrow) {
@@ -578,6 +824,12 @@ TEST(Rasterize, MismatchesThrow) {
   const Image wide(41, 40, 1);
   EXPECT_THROW(rasterizeBackward(g, camera, *state, Image(40, 40, 3), &wide), Error);
   EXPECT_THROW(rasterizeBackward(g, camera, *state, Image(40, 40, 3), nullptr, &wide), Error);
+  BackwardExtras extras;
+  const Image two(40, 40, 2);
+  extras.d_channels = &two;
+  EXPECT_THROW(rasterizeBackward(g, camera, *state, Image(40, 40, 3), nullptr, nullptr, extras),
+               Error);
+  EXPECT_THROW(rasterize(g, camera, RasterSettings(), nullptr, {2, nullptr}), Error);
   Gaussians fewer = randomScene(4, 0, camera, 74);
   EXPECT_THROW(rasterizeBackward(fewer, camera, *state, Image(40, 40, 3)), Error);
   Camera bad = camera;
