@@ -1,5 +1,5 @@
 # Sourced by examples/demo.sh and tests/run.sh, which set `root` to the repository's root.
-# install_packages, then build TARGET...: quick when there is nothing to do.
+# install_packages, then build TARGET...: quick when there is nothing to do. install_assets where rooms are made.
 : "${root:?}"
 
 as_root() {
@@ -41,6 +41,25 @@ $package
       apt-get install -y -qq --no-install-recommends $missing >&2
   fi
   use_openblas
+}
+
+# The furniture that rooms are made of (Debian, 137 MB to load): sweethome3d-furniture, and the jar out of
+# sweethome3d without the Java that the package asks for.
+install_assets() {
+  assets=/usr/local/share/sweethome3d
+  if [ ! -d /usr/share/sweethome3d/furniture ]; then
+    echo "setup: installing sweethome3d-furniture" >&2
+    as_root env DEBIAN_FRONTEND=noninteractive apt-get update -qq >&2
+    as_root env DEBIAN_FRONTEND=noninteractive \
+      apt-get install -y -qq --no-install-recommends sweethome3d-furniture >&2
+  fi
+  if [ ! -e /usr/share/sweethome3d/sweethome3d.jar ] && [ ! -e "$assets/sweethome3d.jar" ]; then
+    echo "setup: putting sweethome3d.jar into $assets" >&2
+    folder=$(mktemp -d)
+    (cd "$folder" && apt-get download -qq sweethome3d >&2 && dpkg -x sweethome3d_*.deb .)
+    as_root install -D -m 644 "$folder/usr/share/sweethome3d/sweethome3d.jar" "$assets/sweethome3d.jar"
+    rm -rf "$folder"
+  fi
 }
 
 # libtorch calls whatever libblas.so.3 is: OpenBLAS is 20 to 60 times faster than the reference one.

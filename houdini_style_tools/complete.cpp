@@ -126,9 +126,11 @@ Image contactSheet(const std::vector<View>& views, const Completion& completion,
           i * kTileWidth, 0, &sheet);
   }
   const std::vector<Camera> cameras = novelCameras(views, up, kTileWidth, height);
+  RasterSettings settings;
+  settings.antialias = completion.whole_decoded.gaussians.antialias;
   for (int i = 0; i < columns; ++i) {
-    paste(rasterize(completion.seen_decoded.gaussians, cameras[size_t(i)], {}).colour, i * kTileWidth, height, &sheet);
-    paste(rasterize(completion.whole_decoded.gaussians, cameras[size_t(i)], {}).colour, i * kTileWidth, 2 * height, &sheet);
+    paste(rasterize(completion.seen_decoded.gaussians, cameras[size_t(i)], settings).colour, i * kTileWidth, height, &sheet);
+    paste(rasterize(completion.whole_decoded.gaussians, cameras[size_t(i)], settings).colour, i * kTileWidth, 2 * height, &sheet);
   }
   return sheet;
 }

@@ -13,6 +13,7 @@
 
 #include "examples/rooms/rooms.h"
 #include "houdini_style_tools/scenes.h"
+#include "splat/metrics.h"
 #include "splat/rasterize.h"
 
 namespace vdbc {
@@ -41,19 +42,14 @@ struct MethodOutput {
   std::vector<Coord> voxels;
 };
 
-EvaluationScene roomScene(uint64_t seed, int views) {
-  requireHeldOut(seed);
+EvaluationScene roomScene(const Room& room, uint64_t seed, int views) {
   EvaluationScene s;
-  s.name = "rooms:" + std::to_string(seed);
-  const Room room = makeRoom(seed);
+  s.name = room.name;
   const RoomRenderer renderer(room);
-  std::mt19937_64 random(seed);
-  int i = 0;
-  for (const Camera& camera : randomCameras(room, views + kTargetViews, kRoomSide, kRoomSide, random)) {
-    (i < views ? s.input : s.targets).push_back(renderer.render(camera, 4 * kRoomSamples, seed + uint64_t(i)));
-    ++i;
-  }
-  s.truth = room.mesh;
+  s.input = roomViews(room, renderer, views + kTargetViews, kRoomSide, kRoomSide, kRoomSamples, seed);
+  s.targets.assign(s.input.begin() + views, s.input.end());
+  s.input.resize(size_t(views));
+  s.truth = solidMesh(room.surface);
   s.free_points = freePoints(room, 64, seed);
   return s;
 }
@@ -164,18 +160,42 @@ MethodOutput manhattanBox(const MethodOutput& observed, const SceneVoxels& seen,
   return out;
 }
 
+// What the target views' cameras see of the Gaussians, against what is there.
+void measurePictures(const EvaluationScene& scene, const Gaussians& gaussians, const UserNets& nets,
+                     MethodResult* r) {
+  const double share = 1 / double(scene.targets.size());
+  RasterSettings settings;
+  settings.antialias = gaussians.antialias, settings.median_depth = true;
+  std::vector<double> medians, rmses;
+  if (!nets.lpips) r->lpips = kNan;
+  for (const View& target : scene.targets) {
+    RasterOutput out = rasterize(gaussians, target.camera, settings);
+    for (float& v : out.colour.data) v = std::clamp(v, 0.f, 1.f);
+    r->psnr += share * psnr(out.colour, target.colour);
+    r->ssim += share * ssim(out.colour, target.colour);
+    r->flip += share * flip(target.colour, out.colour);
+    if (nets.lpips) r->lpips += share * nets.lpips->distance(target.colour, out.colour);
+    if (nets.features) {
+      r->features.push_back(nets.features->features(out.colour));
+      r->true_features.push_back(nets.features->features(target.colour));
+    }
+    const DepthError depth = depthError(out.median_depth.data, target.depth);
+    if (std::isnan(depth.rmse_m)) continue;
+    r->depth_share += share * depth.share;
+    medians.push_back(depth.median_abs_m), rmses.push_back(depth.rmse_m);
+  }
+  const auto mean = [](const std::vector<double>& values) {
+    return values.empty() ? kNan : std::accumulate(values.begin(), values.end(), 0.) / double(values.size());
+  };
+  r->depth_median_m = mean(medians), r->depth_rmse_m = mean(rmses);
+}
+
 MethodResult measure(const std::string& method, const EvaluationScene& scene, const MethodOutput& output,
-                     const VoxelFrame& frame, const NodeStates& states) {
+                     const VoxelFrame& frame, const NodeStates& states, const UserNets& nets) {
   MethodResult r;
   r.scene = scene.name, r.method = method, r.views = int(scene.input.size());
   r.gaussians = output.gaussians.size();
-  r.psnr = r.ssim = 0;
-  for (const View& target : scene.targets) {
-    Image image = rasterize(output.gaussians, target.camera, {}).colour;
-    for (float& v : image.data) v = std::clamp(v, 0.f, 1.f);
-    r.psnr += psnr(image, target.colour) / double(scene.targets.size());
-    r.ssim += ssim(image, target.colour) / double(scene.targets.size());
-  }
+  measurePictures(scene, output.gaussians, nets, &r);
   r.precision = r.recall = r.f1 = r.leak = kNan;
   if (!scene.truth) return r;
   auto unobserved = [&](const Coord& node) { return states.at(node) == NodeState::kUnobserved; };
@@ -194,29 +214,55 @@ MethodResult measure(const std::string& method, const EvaluationScene& scene, co
   return r;
 }
 
+Eigen::MatrixXd rowsOf(const std::vector<std::vector<float>>& rows) {
+  Eigen::MatrixXd m(rows.size(), rows[0].size());
+  for (size_t i = 0; i < rows.size(); ++i) {
+    require(rows[i].size() == rows[0].size(), "--features: expected ", rows[0].size(),
+            " features of every picture, found ", rows[i].size());
+    m.row(Eigen::Index(i)) = Eigen::Map<const Eigen::RowVectorXf>(rows[i].data(), m.cols()).cast<double>();
+  }
+  return m;
+}
+
 }  // namespace
 
 SceneList sceneList(const std::string& spec, int views, const std::vector<int>& frames, uint64_t seed) {
-  if (spec.rfind("rooms:", 0) == 0) {
-    unsigned long long first = 0, last = 0;
-    int used = 0;
-    const char* text = spec.c_str() + 6;
-    const int found = std::sscanf(text, "%llu%n-%llu%n", &first, &used, &last, &used);
-    if (found == 1) last = first;
-    if (found < 1 || text[used] != '\0' || last < first || last - first > 100000)
-      throw UsageError(joinText("--scenes: ", spec, ": expected rooms:SEED or rooms:SEED-SEED"));
-    if (!frames.empty()) throw UsageError("--frames: expected a folder as --scenes, found rooms");
+  const bool is_rooms = spec.rfind("rooms:", 0) == 0, is_homes = spec.rfind("homes:", 0) == 0;
+  if (!is_rooms && !is_homes)
+    return {1, [=](int64_t) { return folderScene(spec, views, frames, seed); }};
+  unsigned long long first = 0, last = 0;
+  int used = 0;
+  const char* text = spec.c_str() + 6;
+  const int found = std::sscanf(text, "%llu%n-%llu%n", &first, &used, &last, &used);
+  if (found == 1) last = first;
+  if (found < 1 || text[used] != '\0' || last < first || last - first > 100000)
+    throw UsageError(joinText("--scenes: ", spec, ": expected rooms:N, rooms:N-N, homes:N or homes:N-N"));
+  if (!frames.empty()) throw UsageError("--frames: expected a folder as --scenes, found rooms");
+  if (is_rooms) {
     for (uint64_t s : {uint64_t(first), uint64_t(last)}) requireHeldOut(s);
-    return {int64_t(last - first + 1), [=](int64_t i) { return roomScene(first + uint64_t(i), views); }};
+    return {int64_t(last - first + 1), [=](int64_t i) {
+              const uint64_t s = first + uint64_t(i);
+              requireHeldOut(s);
+              return roomScene(makeRoom(roomAssets(), s), s, views);
+            }};
   }
-  return {1, [=](int64_t) { return folderScene(spec, views, frames, seed); }};
+  const int homes = homeRoomCount(roomAssets());
+  if (last >= uint64_t(homes))
+    throw UsageError(joinText("--scenes: ", spec, ": expected numbers below ", homes));
+  return {int64_t(last - first + 1), [=](int64_t i) {
+            const int index = int(first) + int(i);
+            return roomScene(homeRoom(roomAssets(), index), uint64_t(index), views);
+          }};
 }
 
 std::string resultJson(const MethodResult& r) {
   nlohmann::ordered_json j;
   auto number = [](double v) { return std::isfinite(v) ? nlohmann::ordered_json(v) : nlohmann::ordered_json(); };
   j["scene"] = r.scene, j["views"] = r.views, j["method"] = r.method;
-  j["psnr"] = number(r.psnr), j["ssim"] = number(r.ssim);
+  j["psnr"] = number(r.psnr), j["ssim"] = number(r.ssim), j["flip"] = number(r.flip);
+  j["lpips"] = number(r.lpips), j["fid"] = number(r.fid), j["kid"] = number(r.kid);
+  j["depth_median_m"] = number(r.depth_median_m), j["depth_rmse_m"] = number(r.depth_rmse_m);
+  j["depth_share"] = number(r.depth_share);
   j["precision"] = number(r.precision), j["recall"] = number(r.recall), j["f1"] = number(r.f1);
   j["leak"] = number(r.leak), j["seconds"] = number(r.seconds);
   j["peak_rss_mb"] = number(r.peak_rss_mb), j["gaussians"] = r.gaussians;
@@ -225,13 +271,13 @@ std::string resultJson(const MethodResult& r) {
 
 std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Encoder& encoder,
                                         const Completer& completer, const SceneSettings& settings,
-                                        Progress& progress) {
+                                        Progress& progress, const UserNets& nets) {
   SceneSettings s = settings;
   s.volume.up = scene.up;
   std::vector<MethodResult> results;
   auto add = [&](const char* method, const MethodOutput& output, double seconds, const VoxelFrame& frame,
                  const NodeStates& states) {
-    results.push_back(measure(method, scene, output, frame, states));
+    results.push_back(measure(method, scene, output, frame, states, nets));
     results.back().seconds = seconds, results.back().peak_rss_mb = peakMemoryMb();
   };
 
@@ -285,16 +331,26 @@ std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results) 
     MethodResult mean;
     mean.scene = "mean", mean.method = method;
     for (double MethodResult::*field :
-         {&MethodResult::psnr, &MethodResult::ssim, &MethodResult::precision, &MethodResult::recall,
-          &MethodResult::f1, &MethodResult::leak, &MethodResult::seconds, &MethodResult::peak_rss_mb}) {
+         {&MethodResult::psnr, &MethodResult::ssim, &MethodResult::flip, &MethodResult::lpips,
+          &MethodResult::depth_median_m, &MethodResult::depth_rmse_m, &MethodResult::depth_share,
+          &MethodResult::precision, &MethodResult::recall, &MethodResult::f1, &MethodResult::leak, &MethodResult::seconds, &MethodResult::peak_rss_mb}) {
       double sum = 0, n = 0;
       for (const MethodResult& r : results)
         if (r.method == method && std::isfinite(r.*field)) sum += r.*field, ++n;
       mean.*field = n > 0 ? sum / n : kNan;
     }
     int64_t gaussians = 0, n = 0;
-    for (const MethodResult& r : results)
-      if (r.method == method) gaussians += r.gaussians, ++n, mean.views = r.views;
+    std::vector<std::vector<float>> features, true_features;
+    for (const MethodResult& r : results) {
+      if (r.method != method) continue;
+      gaussians += r.gaussians, ++n, mean.views = r.views;
+      features.insert(features.end(), r.features.begin(), r.features.end());
+      true_features.insert(true_features.end(), r.true_features.begin(), r.true_features.end());
+    }
+    if (features.size() > 1) {
+      const Eigen::MatrixXd a = rowsOf(true_features), b = rowsOf(features);
+      mean.fid = frechetDistance(a, b), mean.kid = kernelDistance(a, b);
+    }
     mean.gaussians = gaussians / std::max<int64_t>(1, n);
     means.push_back(mean);
   }

@@ -14,8 +14,8 @@
 #include "houdini_style_tools/complete.h"
 #include "houdini_style_tools/console.h"
 #include "houdini_style_tools/evaluate.h"
+#include "houdini_style_tools/render.h"
 #include "houdini_style_tools/scenes.h"
-#include "splat/rasterize.h"
 
 namespace vdbc {
 namespace {
@@ -37,21 +37,23 @@ struct Complete {
   double child_tau = SceneSettings().child_threshold;
   double temperature = 1;
   int sampling_steps = 0;
-  bool refine_observed = false;
+  bool refine_observed = false, antialias = false;
 };
 struct Render {
-  std::string splats, cameras, frames, output;
-  int width = 0;
+  RenderSettings settings;
+  std::string frames;
+  std::vector<int> size;
+  std::vector<double> up;
 };
 struct Check {
   std::string views, frames, volume;
 };
 struct Evaluate {
-  std::string scenes, frames, weights;
+  std::string scenes, frames, weights, lpips, features;
   int views = 2;
 };
 struct Train {
-  std::string output, work, preset = "small", encoder;
+  std::string output, work, cache, preset = "small", encoder;
   int64_t steps = 0, scenes = 0;
   double rate = 0;
   bool resume = false;
@@ -107,9 +109,8 @@ SceneSettings sceneSettings(const Complete& o, const Common& common, const Eigen
   return s;
 }
 
-Eigen::Vector3d upOf(const Complete& o) {
-  if (o.up.empty()) return conventionalUp(o.views);
-  const Eigen::Vector3d up(o.up[0], o.up[1], o.up[2]);
+Eigen::Vector3d upOf(const std::vector<double>& given) {
+  const Eigen::Vector3d up(given[0], given[1], given[2]);
   if (!up.allFinite() || up.norm() < 1e-6) throw UsageError("--up: expected a finite vector that is not zero");
   return up.normalized();
 }
@@ -131,12 +132,13 @@ void cookComplete(const Complete& o, const Common& common, Progress& progress) {
   const auto start = std::chrono::steady_clock::now();
   progress.start("read");
   const std::vector<View> views = readViews(o.views, {frames, 0});
-  const Eigen::Vector3d up = upOf(o);
+  const Eigen::Vector3d up = o.up.empty() ? conventionalUp(o.views) : upOf(o.up);
   const SceneSettings settings = sceneSettings(o, common, up);
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
   progress.end();
-  const Completion c = naming(o.views, [&] { return completeScene(views, encoder, completer, settings, progress); });
+  Completion c = naming(o.views, [&] { return completeScene(views, encoder, completer, settings, progress); });
+  for (DecodedGrid* d : {&c.seen_decoded, &c.whole_decoded}) d->gaussians.antialias = o.antialias;
   writeCompletion(views, c, stem, up, progress);
   const double seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   if (common.json) {
@@ -179,29 +181,23 @@ void cookInfo(const Common& common, int threads) {
     std::printf("%-13s %s\n", key.c_str(), value.is_string() ? value.get<std::string>().c_str() : value.dump().c_str());
 }
 
-Gaussians readSplats(const std::string& path) {
-  if (fs::path(path).extension() == ".ply") return readPly(path);
-  if (fs::path(path).extension() == ".vdb") return readPointsVdb(path);
-  throw UsageError(joinText("render: ", path, ": expected .ply or .points.vdb"));
-}
-
 void cookRender(const Render& o, const Common& common, Progress& progress) {
-  const Gaussians g = readSplats(o.splats);
-  const std::vector<View> views = readViews(o.cameras, {frameList(o.frames), 0});
-  std::error_code error;
-  fs::create_directories(o.output, error);
-  require(!error && fs::is_directory(o.output), "render: ", o.output, ": cannot create the folder");
-  progress.start("render");
-  for (size_t i = 0; i < views.size(); ++i) {
-    report(progress, int(100 * i / views.size()));
-    Camera c = views[i].camera;
-    if (o.width > 0) c = resized(c, o.width, std::max(1, int(std::lround(double(c.height) * o.width / c.width))));
-    char name[32];
-    std::snprintf(name, sizeof name, "/%04zu.png", i);
-    writePng(rasterize(g, c, {}).colour, o.output + name);
-    if (common.json) std::printf("%s\n", ordered_json{{"view", views[i].name}, {"image", o.output + name}}.dump().c_str());
-  }
-  progress.end();
+  RenderSettings s = o.settings;
+  s.frames = frameList(o.frames);
+  if (!o.size.empty()) s.width = o.size[0], s.height = o.size[1];
+  if (!o.up.empty()) s.up = upOf(o.up);
+  int count = 0;
+  std::string last;
+  renderFrames(s, [&](const RenderedFrame& f) {
+    ++count, last = f.image;
+    if (!common.json) return;
+    ordered_json j{{"frame", f.number}, {"image", f.image}};
+    if (!f.preview.empty()) j["preview"] = f.preview;
+    if (!f.view.empty()) j["view"] = f.view;
+    std::printf("%s\n", j.dump().c_str());
+    std::fflush(stdout);
+  }, progress);
+  if (!common.json) std::printf("%d frame%s: %s\n", count, count == 1 ? "" : "s, the last one", last.c_str());
 }
 
 void cookCheck(const Check& o, const Common& common) {
@@ -223,6 +219,9 @@ void cookCheck(const Check& o, const Common& common) {
 
 void cookEvaluate(const Evaluate& o, const Complete& options, const Common& common, Progress& progress) {
   const SceneList scenes = sceneList(o.scenes, o.views, frameList(o.frames), common.seed);
+  UserNets nets;
+  if (!o.lpips.empty()) nets.lpips = std::make_shared<const PerceptualNet>(o.lpips);
+  if (!o.features.empty()) nets.features = std::make_shared<const FeatureNet>(o.features);
   const std::string weights = weightsFolder(o.weights);
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
@@ -232,16 +231,22 @@ void cookEvaluate(const Evaluate& o, const Complete& options, const Common& comm
     if (common.json) {
       std::printf("%s\n", resultJson(r).c_str());
     } else {
-      std::printf("%-14s %-17s psnr %6.2f  ssim %.3f  precision %.3f  recall %.3f  f1 %.3f  leak %.3f  %6.2f s  %5.0f MB  %lld\n",
-                  r.scene.c_str(), r.method.c_str(), r.psnr, r.ssim, r.precision, r.recall, r.f1, r.leak,
-                  r.seconds, r.peak_rss_mb, static_cast<long long>(r.gaussians));
+      char perceived[96] = "";
+      int used = 0;
+      if (nets.lpips) used = std::snprintf(perceived, sizeof perceived, "lpips %.3f  ", r.lpips);
+      if (!std::isnan(r.fid))
+        std::snprintf(perceived + used, sizeof perceived - size_t(used), "fid %.2f  kid %.4f  ", r.fid, r.kid);
+      std::printf("%-14s %-17s psnr %6.2f  ssim %.3f  flip %.3f  %sdepth %.3f m  precision %.3f  recall %.3f  f1 %.3f  leak %.3f  %6.2f s  %5.0f MB  %lld\n",
+                  r.scene.c_str(), r.method.c_str(), r.psnr, r.ssim, r.flip, perceived,
+                  r.depth_median_m, r.precision, r.recall, r.f1, r.leak, r.seconds,
+                  r.peak_rss_mb, static_cast<long long>(r.gaussians));
     }
     std::fflush(stdout);
   };
   for (int64_t i = 0; i < scenes.count; ++i) {
     const EvaluationScene scene = scenes.scene(i);
     for (const MethodResult& r :
-         naming(scene.name, [&] { return evaluateScene(scene, encoder, completer, settings, progress); })) {
+         naming(scene.name, [&] { return evaluateScene(scene, encoder, completer, settings, progress, nets); })) {
       show(r);
       all.push_back(r);
     }
@@ -283,10 +288,12 @@ void cookTrainEncoder(const Train& t, const Common& common, Progress& progress) 
   constexpr int kValidationRooms = 12;
   const EncoderConfig config = t.preset == "paper" ? EncoderConfig::paper() : EncoderConfig::small();
   TrainSettings s = trainSettings(t, common);
-  s.metadata["trained_on"] = seedRange(kEncoderTrainingSeed, t.scenes);
+  s.metadata["trained_on"] = seedRange(kTrainingSeed, t.scenes);
   s.metadata["validated_on"] = seedRange(kValidationSeed, kValidationRooms);
-  trainEncoder(config, [](uint64_t i) { return roomViews(kEncoderTrainingSeed + i, kRoomViews); }, t.scenes,
-               [](uint64_t i) { return roomViews(kValidationSeed + i, kRoomViews); }, kValidationRooms, s,
+  auto source = [&](uint64_t first) {
+    return [&t, first](uint64_t i) { return trainingViews(first + i, t.cache); };
+  };
+  trainEncoder(config, source(kTrainingSeed), t.scenes, source(kValidationSeed), kValidationRooms, s,
                trainListener(common.json), progress);
 }
 
@@ -296,22 +303,22 @@ void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
   CompleterConfig config = t.preset == "paper" ? CompleterConfig::paper() : CompleterConfig::small();
   config.latent_dim = encoder.config().latent_dim, config.latent_groups = encoder.config().latent_groups;
   TrainSettings s = trainSettings(t, common);
-  s.metadata["trained_on"] = seedRange(kCompleterTrainingSeed, t.scenes);
+  s.metadata["trained_on"] = seedRange(kTrainingSeed, t.scenes);
   s.metadata["validated_on"] = seedRange(kValidationSeed, kValidationRooms);
   s.metadata["encoder_hash"] = encoder.hash();
   s.validate_every = 1000;  // roll-outs take seconds each
   // Samples depend on the encoder: its hash names their folder.
-  const std::string cache = s.work_folder + "/samples_" + encoder.hash();
+  const std::string samples = s.work_folder + "/samples_" + encoder.hash();
   auto source = [&](uint64_t first) {
-    return [&, first](uint64_t i) { return completionSample(encoder, first + i, cache); };
+    return [&, first](uint64_t i) { return completionSample(encoder, first + i, t.cache, samples); };
   };
   progress.start("encode rooms");
   for (int64_t i = 0; i < t.scenes; ++i) {
-    source(kCompleterTrainingSeed)(uint64_t(i));
+    source(kTrainingSeed)(uint64_t(i));
     report(progress, int(100 * i / t.scenes));
   }
   progress.end();
-  trainCompleter(config, source(kCompleterTrainingSeed), t.scenes, source(kValidationSeed), kValidationRooms, s,
+  trainCompleter(config, source(kTrainingSeed), t.scenes, source(kValidationSeed), kValidationRooms, s,
                  trainListener(common.json), progress);
 }
 
@@ -343,12 +350,30 @@ void addCompletion(CLI::App* app, Complete* o) {
   app->add_flag("--refine-observed", o->refine_observed, "let the completer rewrite observed latents");
 }
 
+void addRender(CLI::App* verb, Render* o) {
+  RenderSettings& s = o->settings;
+  verb->add_option("SPLATS", s.splats, ".ply or .points.vdb")->required();
+  verb->add_option("--cameras", s.cameras, "views whose cameras to take");
+  verb->add_option("--turntable", s.turntable, "frames of a turn around the splats")->check(CLI::Range(1, 100000));
+  verb->add_option("--flythrough", s.flythrough, "frames of a smooth flight through the --cameras")->check(CLI::Range(1, 100000));
+  verb->add_option("--frames", o->frames, "numbers of the frames to render, 0,3,5-9 say [all]");
+  auto* width = verb->add_option("--width", s.width, "pixels, in the view's proportion [the view's]")->check(CLI::Range(1, 16384));
+  verb->add_option("--size", o->size, "width and height in pixels [the view's; 960 540 for a turntable]")
+      ->expected(2)->check(CLI::Range(1, 16384))->excludes(width);
+  verb->add_option("--fov", s.fov_degrees, "field of view across, degrees [the view's; 60 for a turntable]")->check(Between(1, 170));
+  verb->add_option("--up", o->up, "x y z that points up: axis of the turntable [0 0 1]")->expected(3);
+  verb->add_flag("--antialias,!--no-antialias", s.antialias, "opacity-compensated low pass [as the file says]");
+  verb->add_flag("--preview", s.preview, "a .png beside each .exr");
+  verb->add_option("-o,--output", s.output, "folder for 0000.png, ..., or a name with #### ending in .png or .exr")->required();
+}
+
 void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rate) {
   verb->add_option("-o,--output", t->output, "weights to write (.safetensors)")->required();
   verb->add_option("--work", t->work, "folder for checkpoint, log and pictures [OUTPUT.work]");
+  verb->add_option("--cache", t->cache, "folder of rooms from make_rooms; missing ones are put there [render each time]");
   verb->add_option("--preset", t->preset, "small or paper")->check(CLI::IsMember({"small", "paper"}))->capture_default_str();
   auto* s = verb->add_option("--steps", t->steps, joinText("training steps [", steps, "]"))->check(CLI::Range(int64_t(1), int64_t(1) << 40));
-  auto* n = verb->add_option("--rooms", t->scenes, joinText("procedural rooms to train on [", rooms, "]"))
+  auto* n = verb->add_option("--rooms", t->scenes, joinText("furnished rooms to train on [", rooms, "]"))
                 ->check(CLI::Range(int64_t(1), int64_t(kReservedSeeds)));
   auto* r = verb->add_option("--rate", t->rate, joinText("peak learning rate [", rate, "]"))->check(Between(0, 1));
   verb->add_flag("--resume", t->resume, "continue from the checkpoint in the work folder");
@@ -378,16 +403,13 @@ int run(int argc, char** argv) {
   app.add_option("-o,--output", complete.output, "X.vdb to write, with X.points.vdb, X.ply and X.png beside it");
   app.add_option("--weights", complete.weights, "folder with encoder.safetensors and completer.safetensors");
   app.add_option("--up", complete.up, "x y z that points up in the world [the format's]")->expected(3);
+  app.add_flag("--antialias", complete.antialias, "splats are for an opacity-compensated low pass; the files say so");
   app.add_option("--bounds", complete.bounds, "x0 y0 z0 x1 y1 z1 to complete [seen and margin]")->expected(6);
   addCompletion(&app, &complete);
 
   CLI::App* info = app.add_subcommand("info", "BLAS, threads, speed and weights");
-  CLI::App* verb_render = app.add_subcommand("render", "Gaussians from the cameras of some views, as PNG");
-  verb_render->add_option("SPLATS", render.splats, ".ply or .points.vdb")->required();
-  verb_render->add_option("--cameras", render.cameras, "views whose cameras to take")->required();
-  verb_render->add_option("--frames", render.frames, "which of the views [all]");
-  verb_render->add_option("--width", render.width, "pixels [the view's]")->check(CLI::Range(1, 16384));
-  verb_render->add_option("-o,--output", render.output, "folder for 0000.png, ...")->required();
+  CLI::App* verb_render = app.add_subcommand("render", "Gaussians as pictures: from given cameras, around them or along a flight");
+  addRender(verb_render, &render);
   CLI::App* verb_check = app.add_subcommand("check", "depth agreement and open directions, by Embree");
   verb_check->add_option("VIEWS", check.views, "views to compare with")->required();
   verb_check->add_option("VOLUME", check.volume, "X.vdb")->required();
@@ -397,8 +419,10 @@ int run(int argc, char** argv) {
   verb_eval->add_option("--views", evaluate.views, "input views a scene")->check(CLI::Range(1, 1000))->capture_default_str();
   verb_eval->add_option("--frames", evaluate.frames, "input frames of a folder [--views random ones]");
   verb_eval->add_option("--weights", evaluate.weights, "folder with encoder.safetensors and completer.safetensors");
+  verb_eval->add_option("--lpips", evaluate.lpips, "your TorchScript network of two pictures [none]");
+  verb_eval->add_option("--features", evaluate.features, "your TorchScript network of one picture, for FID and KID [none]");
   addCompletion(verb_eval, &eval_options);
-  CLI::App* verb_train = app.add_subcommand("train", "trains a network on procedural rooms");
+  CLI::App* verb_train = app.add_subcommand("train", "trains a network on furnished rooms");
   verb_train->require_subcommand(1);
   CLI::App* train_encoder = verb_train->add_subcommand("encoder", "the encoder-decoder");
   addTrain(train_encoder, &train, 4000, 1000, 1e-3);

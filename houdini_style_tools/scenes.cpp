@@ -2,9 +2,7 @@
 
 #include <algorithm>
 #include <filesystem>
-#include <random>
 
-#include "examples/rooms/rooms.h"
 #include "vdb/scene_volume.h"
 
 namespace vdbc {
@@ -12,19 +10,30 @@ namespace vdbc {
 namespace fs = std::filesystem;
 
 void requireHeldOut(uint64_t seed) {
-  for (uint64_t first : {kEncoderTrainingSeed, kCompleterTrainingSeed, kValidationSeed})
+  for (uint64_t first : {kTrainingSeed, kValidationSeed})
     require(seed < first || seed >= first + kReservedSeeds, "eval: rooms:", seed,
             ": this seed is reserved for training (expected one outside ", first, "-",
             first + kReservedSeeds - 1, ")");
 }
 
-std::vector<View> roomViews(uint64_t seed, int count) {
-  const Room room = makeRoom(seed);
-  const RoomRenderer renderer(room);
-  std::mt19937_64 random(seed);
-  std::vector<View> views;
-  for (const Camera& camera : randomCameras(room, count, kRoomSide, kRoomSide, random))
-    views.push_back(renderer.render(camera, kRoomSamples, seed + views.size()));
+const AssetLibrary& roomAssets() {
+  static const AssetLibrary assets = AssetLibrary::open();
+  return assets;
+}
+
+std::vector<View> trainingViews(uint64_t seed, const std::string& cache_folder) {
+  const std::string folder = cache_folder + "/" + std::to_string(seed);
+  if (!cache_folder.empty() && fs::exists(folder + "/transforms.json")) {
+    std::vector<View> views = readViews(folder);
+    require(int(views.size()) >= kRoomViews, folder, ": expected ", kRoomViews, " views or more, found ",
+            views.size());
+    views.resize(size_t(kRoomViews));
+    return views;
+  }
+  const Room room = makeRoom(roomAssets(), seed);
+  std::vector<View> views = roomViews(room, RoomRenderer(room), kRoomViews, kRoomSide, kRoomSide,
+                                      kRoomSamples, seed);
+  if (!cache_folder.empty()) writeViews(views, folder);
   return views;
 }
 
@@ -38,10 +47,11 @@ VoxelFrame completionFrame(const std::vector<View>& views, const EncoderConfig& 
   return fitVolume(depth, volume, CarveSettings());
 }
 
-CompletionSample completionSample(const Encoder& encoder, uint64_t seed, const std::string& cache_folder) {
-  const std::string path = cache_folder + "/" + std::to_string(seed) + ".sample";
+CompletionSample completionSample(const Encoder& encoder, uint64_t seed,
+                                  const std::string& cache_folder, const std::string& sample_folder) {
+  const std::string path = sample_folder + "/" + std::to_string(seed) + ".sample";
   if (fs::exists(path)) return readSample(path);
-  const std::vector<View> views = roomViews(seed, kRoomViews);
+  const std::vector<View> views = trainingViews(seed, cache_folder);
   // The cameras are random already: the first n are a random choice. Two views are the hardest case
   // that is promised, so half of the samples have two.
   static constexpr size_t kCounts[] = {1, 2, 2, 2, 2, 3, 4, 6};
@@ -56,7 +66,7 @@ CompletionSample completionSample(const Encoder& encoder, uint64_t seed, const s
   s.target = encoder.encode(views, dense, silent);
   s.seen_nodes = poolStates(frame, sparse.space, 1), s.seen_coarse = poolStates(frame, sparse.space, 2);
   s.target_nodes = poolStates(frame, dense.space, 1), s.target_coarse = poolStates(frame, dense.space, 2);
-  fs::create_directories(cache_folder);
+  fs::create_directories(sample_folder);
   writeSample(s, path);
   return s;
 }

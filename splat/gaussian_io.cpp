@@ -28,7 +28,10 @@ namespace {
 
 constexpr uint64_t kMaxFileBytes = uint64_t(1) << 38;
 constexpr float kMaxLogit = 15.f;  // 3DGS tools take the sigmoid in float
-constexpr int kShSlots = 16;       // GS_SPH_R has room for degree 3 whatever the degree
+// What other programs call the opacity-compensated low pass, and its absence.
+constexpr const char *kAntialiasedMode = "mip", *kDefaultMode = "default";
+constexpr const char* kModeKey = "splat_render_mode";  // in a grid's metadata
+constexpr int kMaxShSlots = 16;    // of GS_SPH_R in files by others: room for degree 3
 
 bool isFinite(const Gaussians& g, int64_t i) {
   const size_t n = size_t(g.shCoefficients()) * 3, row = size_t(i);
@@ -101,6 +104,7 @@ struct PlyElement {
 
 struct PlyHeader {
   std::vector<PlyElement> elements;
+  bool antialias = false;
   size_t bytes = 0;
 };
 
@@ -136,7 +140,11 @@ PlyHeader parsePlyHeader(const std::vector<uint8_t>& bytes, const std::string& p
     words >> keyword;
     if (line_number == 0) {
       require(line == "ply", prefix, "not a PLY file");
-    } else if (keyword == "comment" || keyword == "obj_info" || keyword.empty()) {
+    } else if (keyword == "comment") {
+      words >> first >> second;
+      if (first == "SplatRenderMode:") header.antialias = second == kAntialiasedMode;
+      if (first == "antialiased") header.antialias = second == "1";
+    } else if (keyword == "obj_info" || keyword.empty()) {
       continue;
     } else if (keyword == "format") {
       words >> first >> second;
@@ -253,6 +261,8 @@ constexpr float kMaxHalf = 65504.f;
 // The 16-bit fixed-point codecs divide [0, 1] (GS_Alpha) and [-.5, .5] (P, voxels) into such steps
 // and round down: half a step more makes that the nearest.
 constexpr float kFixedStep = 1.f / 65535;
+// From here on half floats have their full 11 bits.
+constexpr float kMinNormalHalf = 6.103515625e-5f;
 // Index coordinates stay within +-2^19 so that a leaf's place and a voxel's place in it fit 64
 // bits.
 constexpr int kIndexBits = 20;
@@ -338,12 +348,35 @@ float logitOf(float probability) {
   return std::log(p / (1 - p));
 }
 
+/// To the nearest float with 16 significant bits. OpenVDB has no codec for quaternions, but its
+/// compression takes bytes of equal significance together, so that last bytes of 0 cost nothing.
+float rounded16(float value) {
+  uint32_t bits;
+  std::memcpy(&bits, &value, sizeof(bits));
+  bits = (bits + 0x7f + (bits >> 8 & 1)) & ~0xffu;
+  float result;
+  std::memcpy(&result, &bits, sizeof(result));
+  return std::isfinite(result) ? result : value;
+}
+
+Eigen::Vector3f sigmaOf(const Gaussians& g, int64_t row) {
+  return g.log_scale[size_t(row)].array().exp();
+}
+
+/// Whether half floats hold the sigmas of these rows to their 11 bits.
+bool fitHalf(const Gaussians& g, const std::vector<int64_t>& rows) {
+  return std::all_of(rows.begin(), rows.end(), [&](int64_t row) {
+    const Eigen::Vector3f sigma = sigmaOf(g, row);
+    return sigma.minCoeff() >= kMinNormalHalf && sigma.maxCoeff() <= kMaxHalf;
+  });
+}
+
 void fillLeaf(const Gaussians& g, const Provenance& provenance,
               const std::vector<PlacedRow>& placed, const LeafRows& range,
               const openvdb::math::Transform& transform) {
   PointLeaf& leaf = *range.leaf;
   auto position = writeHandle<Vec3f, PositionCodec>(leaf, "P");
-  auto scale = writeHandle<Vec3f, ExactCodec>(leaf, "scale");
+  openvdb::points::AttributeWriteHandle<Vec3f> scale(leaf.attributeArray("scale"));
   auto orient = writeHandle<Quats, ExactCodec>(leaf, "orient");
   auto alpha = writeHandle<float, UnitCodec>(leaf, "GS_Alpha");
   auto colour = writeHandle<Vec3f, HalfCodec>(leaf, "Cd");
@@ -357,10 +390,10 @@ void fillLeaf(const Gaussians& g, const Provenance& provenance,
     const openvdb::Vec3d p_index =
         transform.worldToIndex(openvdb::Vec3d(mean.x(), mean.y(), mean.z()));
     position.set(n, Vec3f(p_index - openvdb::Coord::round(p_index).asVec3d() + 0.5 * kFixedStep));
-    const Eigen::Vector3f sigma = g.log_scale[row].array().exp();
+    const Eigen::Vector3f sigma = sigmaOf(g, placed[i].row).unaryExpr(&rounded16);
     scale.set(n, Vec3f(sigma.x(), sigma.y(), sigma.z()));
-    const Eigen::Vector4f q = unitRotation(g.rotation[row]);  // w x y z; Houdini has x y z w
-    orient.set(n, Quats(q[1], q[2], q[3], q[0]));
+    const Eigen::Vector4f q = unitRotation(g.rotation[row]).unaryExpr(&rounded16);
+    orient.set(n, Quats(q[1], q[2], q[3], q[0]));  // ours are w x y z, Houdini's x y z w
     alpha.set(n, sigmoid(g.opacity_logit[row]) + 0.5f * kFixedStep);
     const float* sh = g.sh.data() + row * coefficients * 3;
     const auto linear = [&](int c) {
@@ -370,7 +403,7 @@ void fillLeaf(const Gaussians& g, const Provenance& provenance,
     probability.set(n, provenance.probability.empty() ? 1.f : provenance.probability[row]);
     completed.set(n, !provenance.generated.empty() && provenance.generated[row] != 0);
   }
-  for (size_t c = 0; c < 3; ++c) {
+  for (size_t c = 0; c < 3 && g.sh_degree > 0; ++c) {
     auto values = writeHandle<float, HalfCodec>(leaf, kShNames[c]);
     for (size_t i = range.begin; i < range.end; ++i) {
       const float* sh = g.sh.data() + size_t(placed[i].row) * coefficients * 3;
@@ -427,12 +460,18 @@ PointTree::Ptr buildPointTree(const Gaussians& g, const Provenance& provenance,
     leaf.initializeAttributes(descriptor, openvdb::Index(leaves[l].end - leaves[l].begin));
   });
   if (leaves.empty()) return tree;
-  openvdb::points::appendAttribute<Vec3f, ExactCodec>(*tree, "scale");
+  if (fitHalf(g, rows)) {
+    openvdb::points::appendAttribute<Vec3f, HalfCodec>(*tree, "scale");
+  } else {
+    openvdb::points::appendAttribute<Vec3f, ExactCodec>(*tree, "scale");
+  }
   openvdb::points::appendAttribute<Quats, ExactCodec>(*tree, "orient");
   openvdb::points::appendAttribute<float, UnitCodec>(*tree, "GS_Alpha");
   openvdb::points::appendAttribute<Vec3f, HalfCodec>(*tree, "Cd");
-  for (const char* name : kShNames) {
-    openvdb::points::appendAttribute<float, HalfCodec>(*tree, name, 0.f, kShSlots);
+  for (const char* name : kShNames) {  // Cd is all there is of degree 0
+    if (g.sh_degree == 0) break;
+    openvdb::points::appendAttribute<float, HalfCodec>(*tree, name, 0.f,
+                                                       openvdb::Index(g.shCoefficients()));
   }
   openvdb::points::appendAttribute<float, ExactCodec>(*tree, "probability");
   openvdb::points::appendGroup(*tree, "completed");
@@ -461,7 +500,7 @@ int usedShDegree(const std::vector<SplatLeaf>& leaves) {
   for (const SplatLeaf& l : leaves) {
     for (const char* name : kShNames) {
       const auto values = readHandle<float>(*l.leaf, name);
-      const auto stride = std::min<openvdb::Index>(values.stride(), kShSlots);
+      const auto stride = std::min<openvdb::Index>(values.stride(), kMaxShSlots);
       for (openvdb::Index n = 0; n < values.size(); ++n) {
         for (openvdb::Index k = stride; k > openvdb::Index(used + 1) * openvdb::Index(used + 1);
              --k) {
@@ -628,7 +667,13 @@ Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenanc
   }
   Gaussians g;
   g.resize(int64_t(count), degree);
+  const auto mode = grid.getMetadata<openvdb::StringMetadata>(kModeKey);
+  g.antialias = mode && mode->value() == kAntialiasedMode;
   if (provenance) {
+    const auto* first = leaves.empty() ? nullptr : &leaves[0].leaf->attributeSet().descriptor();
+    provenance->recorded =
+        first && (first->hasGroup("completed") ||
+                  first->find("probability") != openvdb::points::AttributeSet::INVALID_POS);
     provenance->generated.assign(count, 0);
     provenance->probability.assign(count, 1.f);
   }
@@ -647,7 +692,7 @@ void writePly(const Gaussians& g, const std::string& path, const Eigen::Vector3f
   const size_t coefficients = size_t(g.shCoefficients()), rest = coefficients - 1;
   std::ostringstream header;
   header << "ply\nformat binary_little_endian 1.0\ncomment Generated by vdb_complete\n"
-         << "comment SplatRenderMode: default\n";
+         << "comment SplatRenderMode: " << (g.antialias ? kAntialiasedMode : kDefaultMode) << '\n';
   if (!up.isZero()) {
     header << "comment Vertical axis: " << up.x() << ' ' << up.y() << ' ' << up.z() << '\n';
   }
@@ -717,6 +762,7 @@ Gaussians readPly(const std::string& path) {
 
   Gaussians g;
   g.resize(int64_t(vertex->count), layout.sh_degree);
+  g.antialias = header.antialias;
   const size_t coefficients = size_t(g.shCoefficients()), rest = coefficients - 1;
   tbb::parallel_for(size_t(0), size_t(vertex->count), [&](size_t i) {
     const uint8_t* row = bytes.data() + offset + i * vertex->row_bytes;
@@ -744,7 +790,7 @@ void writePointsVdb(const Gaussians& g, const Provenance& provenance, const std:
   std::vector<int64_t> rows = writableRows(g);
   rows.erase(std::remove_if(rows.begin(), rows.end(),
                             [&](int64_t row) {  // sigma is stored, not its logarithm
-                              const Eigen::Vector3f sigma = g.log_scale[size_t(row)].array().exp();
+                              const Eigen::Vector3f sigma = sigmaOf(g, row);
                               return !sigma.allFinite() || !(sigma.minCoeff() > 0);
                             }),
              rows.end());
@@ -759,9 +805,13 @@ void writePointsVdb(const Gaussians& g, const Provenance& provenance, const std:
     grid->setCreator("vdb_complete");
     grid->insertMeta("point_count", openvdb::Int64Metadata(int64_t(rows.size())));
     grid->insertMeta("point_attributes",
-                     openvdb::StringMetadata("P scale orient GS_Alpha Cd GS_SPH_R GS_SPH_G "
-                                             "GS_SPH_B probability group:completed"));
+                     openvdb::StringMetadata(joinText(
+                         "P scale orient GS_Alpha Cd ",
+                         g.sh_degree > 0 ? "GS_SPH_R GS_SPH_G GS_SPH_B " : "",
+                         "probability group:completed")));
     grid->insertMeta("sh_degree", openvdb::Int32Metadata(g.sh_degree));
+    grid->insertMeta(kModeKey,
+                     openvdb::StringMetadata(g.antialias ? kAntialiasedMode : kDefaultMode));
     std::ostringstream archive;
     SeekableArchive().writeTo(archive, {grid});
     bytes = archive.str();

@@ -10,11 +10,13 @@ namespace vdbc {
 /// Writes the INRIA layout: binary little endian, x y z nx ny nz f_dc f_rest opacity scale rot, LF,
 /// only `float` properties. Gaussians with NaN or Inf are dropped, opacity logits clamped to +-15,
 /// quaternions normalised (zero ones are dropped too). `up`, unless zero, becomes the comment
-/// `Vertical axis: x y z`. Temporary name, then rename. Throws Error.
+/// `Vertical axis: x y z`; `SplatRenderMode: mip` or `default` tells whether they are antialiased.
+/// Temporary name, then rename. Throws Error.
 void writePly(const Gaussians& gaussians, const std::string& path,
               const Eigen::Vector3f& up = Eigen::Vector3f::Zero());
 /// Reads INRIA-like PLY by any conforming writer: any property order, normals and f_rest optional.
-/// Gaussians with NaN or Inf are dropped, quaternions stay as they are.
+/// Gaussians with NaN or Inf are dropped, quaternions stay as they are. Comments `SplatRenderMode: mip`
+/// and `antialiased 1` make them antialiased.
 /// Throws Error on anything else: truncated, no splat properties, compressed PLY, lists, ASCII.
 Gaussians readPly(const std::string& path);
 
@@ -22,13 +24,16 @@ Gaussians readPly(const std::string& path);
 struct Provenance {
   std::vector<uint8_t> generated;  // [N] 0 or 1
   std::vector<float> probability;  // [N] 0-1
+  bool recorded = false;           // read from the file, which has both or one of them
 };
 
-/// One points grid `splats`: P fixed point 16 bit, scale vec3s, orient quats (x y z w), GS_Alpha,
-/// Cd scene-linear, GS_SPH_R/G/B float[16], groups `completed` (generated ones), `probability`.
-/// Counts are mirrored in metadata. Voxel size is chosen for about 8 points a voxel. Points are
-/// sorted by voxel, so the order of Gaussians is not kept. Empty provenance means observed, 1.
-/// Drops and normalises as writePly() does. Temporary name, then rename. Throws Error.
+/// One points grid `splats`: P fixed point 16 bit, scale vec3s (half, if all sigmas are within its
+/// normal range, else 16 significant bits), orient quats (x y z w, 16 significant bits), GS_Alpha, Cd
+/// scene-linear half, GS_SPH_R/G/B half[(degree + 1)^2] (not for degree 0: Cd is all its colour),
+/// `probability`, group `completed` (generated ones). Metadata: counts, `sh_degree`,
+/// `splat_render_mode` (`mip` if antialiased, or `default`). Voxel size is chosen for about 8 points a
+/// voxel. Points are sorted by voxel, so the order of Gaussians is not kept. Empty provenance means
+/// observed, 1. Drops and normalises as writePly() does. Temporary name, then rename. Throws Error.
 void writePointsVdb(const Gaussians& gaussians, const Provenance& provenance,
                     const std::string& path);
 /// Reads the points grid `splats` (or else the first points grid) with attributes P, scale, orient,

@@ -16,6 +16,7 @@ struct Gaussians {
   std::vector<Eigen::Vector4f> rotation;   // [N] quaternion w x y z; need not be normalised
   std::vector<float> opacity_logit;        // [N]
   std::vector<float> sh;                   // [N, (sh_degree+1)^2, 3] coefficient-major, RGB fastest
+  bool antialias = false;                  // made for RasterSettings::antialias; kept by files
 
   int64_t size() const { return int64_t(mean.size()); }
   int shCoefficients() const { return (sh_degree + 1) * (sh_degree + 1); }

@@ -280,6 +280,15 @@ Camera jsonCamera(const Keys& keys, int image_width, int image_height, const std
   return camera;
 }
 
+/// The keys w and h, if they are there.
+std::optional<std::pair<int, int>> statedSize(const Keys& keys) {
+  const auto w = keys.number("w"), h = keys.number("h");
+  if (!w || !h) return {};
+  require(*w >= 1 && *h >= 1 && *w * *h <= double(kMaxPixels) && *w == std::floor(*w) && *h == std::floor(*h),
+          kRead, ": ", keys.where, ": expected 1 to 2^28 pixels, found ", *w, " x ", *h);
+  return std::pair(int(*w), int(*h));
+}
+
 View readJsonFrame(const Json& json, size_t index, const Applied& applied, const std::string& path,
                    const ReadViewsSettings& settings) {
   const fs::path folder = fs::path(path).parent_path();
@@ -290,15 +299,13 @@ View readJsonFrame(const Json& json, size_t index, const Applied& applied, const
   requirePinhole(keys);
   const auto file_path = keys.text("file_path");
   require(file_path && !file_path->empty(), kRead, ": ", keys.where, ": no file_path");
-  const auto depth_path = keys.text("depth_file_path");
-  require(depth_path && !depth_path->empty(), kRead, ": ", keys.where, " (", *file_path,
-          "): no depth (expected depth_file_path)");
 
   View view;
   view.name = *file_path;
   const std::string image_path = imagePath(folder, *file_path);
-  view.colour = threeChannels(readImage(image_path));
-  const int w = view.colour.width, h = view.colour.height;
+  const auto size = settings.cameras_only ? statedSize(keys) : std::nullopt;
+  if (!size) view.colour = threeChannels(readImage(image_path));
+  const int w = size ? size->first : view.colour.width, h = size ? size->second : view.colour.height;
   view.camera = jsonCamera(keys, w, h, image_path);
 
   const auto matrix = frame.find("transform_matrix");
@@ -310,7 +317,14 @@ View readJsonFrame(const Json& json, size_t index, const Applied& applied, const
   // export.
   pose.linear().rightCols<2>() *= -1;
   view.camera.world_from_camera = applied.file_from_source.inverse() * pose;
+  if (settings.cameras_only) {
+    view.colour = {};
+    return view;
+  }
 
+  const auto depth_path = keys.text("depth_file_path");
+  require(depth_path && !depth_path->empty(), kRead, ": ", keys.where, " (", *file_path,
+          "): no depth (expected depth_file_path)");
   const std::string depth_file = imagePath(folder, *depth_path);
   int depth_w = 0, depth_h = 0;
   const std::vector<uint16_t> stored = readPng16(depth_file, &depth_w, &depth_h);
@@ -550,15 +564,16 @@ View decodeExr(const std::string& path, const std::string& name,
         findChannels(file, {"", "*.Combined.", "rgba.", "beauty.", "C."}, {"R", "G", "B"});
     return set.found() ? set : findChannels(file, {"Y"}, {""});
   }();
-  require(rgb.found(), kRead, ": ", path, ": no colour (expected channels R, G, B)");
+  require(rgb.found() || settings.cameras_only, kRead, ": ", path,
+          ": no colour (expected channels R, G, B)");
   ChannelSet position = findChannels(file, {"P.", "*.Position."}, {"X", "Y", "Z"});
   const ChannelSet lower = findChannels(file, {"P."}, {"x", "y", "z"});
   if (lower.found() && (!position.found() || position.names[0] != "P.X")) position = lower;
   const ChannelSet z = findChannels(file, {"Z", "depth.Z", "*.Depth.Z", "depth", "Pz"}, {""});
-  require(position.found() || z.found(), kRead, ": ", path,
+  require(position.found() || z.found() || settings.cameras_only, kRead, ": ", path,
           ": no depth (expected channels P.X P.Y P.Z or Z)");
 
-  const Imath::Box2i display = file.header(rgb.part).displayWindow();
+  const Imath::Box2i display = file.header(std::max(0, rgb.part)).displayWindow();
   const int64_t w = int64_t(display.max.x) - display.min.x + 1;
   const int64_t h = int64_t(display.max.y) - display.min.y + 1;
   require(w > 0 && h > 0 && uint64_t(w) <= kMaxPixels && uint64_t(h) <= kMaxPixels &&
@@ -570,6 +585,7 @@ View decodeExr(const std::string& path, const std::string& name,
   View view;
   view.name = name;
   view.camera = exrCamera(file, int(w), int(h), path);
+  if (settings.cameras_only) return view;
   const auto read = [&](const ChannelSet& set, float outside) {
     const Imath::Box2i window = file.header(set.part).displayWindow();
     require(window == display, kRead, ": ", path, ": channels ", rgb.names[0], " and ",
@@ -738,10 +754,10 @@ void writeViews(const std::vector<View>& views, const std::string& folder) {
   writeFile(kOperation, (fs::path(folder) / "transforms.json").string(), text.data(), text.size());
 }
 
-void writeViewExr(const View& view, const std::string& path) {
-  constexpr const char* kOperation = "writeViewExr";
-  requireWritable(kOperation, path, view);
-  const Camera& camera = view.camera;
+void writeExr(const Camera& camera, const std::vector<ExrChannel>& channels, const std::string& path) {
+  constexpr const char* kOperation = "writeExr";
+  require(camera.width > 0 && camera.height > 0 && camera.fx > 0 && camera.fy > 0, kOperation, ": ", path,
+          ": expected a camera with pixels, found ", camera.width, " x ", camera.height);
   const size_t w = size_t(camera.width), pixels = w * size_t(camera.height);
 
   // Axes x right, y up, z forward; NDC from (0, 0) upper left to (1, 1) lower right, z / w in [0,
@@ -769,25 +785,22 @@ void writeViewExr(const View& view, const std::string& path) {
   header.compression() = Imf::ZIP_COMPRESSION;
   header.insert("worldToCamera", Imf::M44fAttribute(rowMatrix(axes_from_world)));
   header.insert("worldToNDC", Imf::M44fAttribute(rowMatrix(ndc_from_world)));
-  std::vector<half> colour(3 * pixels);
-  for (size_t i = 0; i < colour.size(); ++i) {
-    colour[i] = half(std::clamp(linearFromSrgb(view.colour.data[i]), -65504.f, 65504.f));
-  }
-  std::vector<float> depth(pixels);
-  for (size_t i = 0; i < pixels; ++i) {
-    const float z = view.depth[i];
-    depth[i] = z > 0 && z < kFarDepth ? z : 1e10f;  // empty pixels as Blender writes them
-  }
   Imf::FrameBuffer buffer;
-  constexpr std::array<const char*, 3> kNames = {"R", "G", "B"};
-  for (size_t c = 0; c < 3; ++c) {
-    header.channels().insert(kNames[c], Imf::Channel(Imf::HALF));
-    buffer.insert(kNames[c], Imf::Slice(Imf::HALF, reinterpret_cast<char*>(colour.data() + c),
-                                        3 * sizeof(half), 3 * sizeof(half) * w));
+  std::vector<std::vector<half>> halves;
+  for (const ExrChannel& c : channels) {
+    header.channels().insert(c.name, Imf::Channel(c.is_half ? Imf::HALF : Imf::FLOAT));
+    if (!c.is_half) {
+      const size_t stride = c.stride * sizeof(float);
+      buffer.insert(c.name, Imf::Slice(Imf::FLOAT, reinterpret_cast<char*>(const_cast<float*>(c.values)),
+                                       stride, stride * w));
+      continue;
+    }
+    std::vector<half>& values = halves.emplace_back(pixels);
+    for (size_t i = 0; i < pixels; ++i)
+      values[i] = half(std::clamp(c.values[i * c.stride], -65504.f, 65504.f));
+    buffer.insert(c.name, Imf::Slice(Imf::HALF, reinterpret_cast<char*>(values.data()), sizeof(half),
+                                     sizeof(half) * w));
   }
-  header.channels().insert("Z", Imf::Channel(Imf::FLOAT));
-  buffer.insert("Z", Imf::Slice(Imf::FLOAT, reinterpret_cast<char*>(depth.data()), sizeof(float),
-                                sizeof(float) * w));
   TemporaryFile temporary(kOperation, path);
   try {
     Imf::OutputFile file(temporary.path().c_str(), header);
@@ -797,6 +810,18 @@ void writeViewExr(const View& view, const std::string& path) {
     throw Error(joinText(kOperation, ": ", path, ": cannot write: ", error.what()));
   }
   temporary.commit();
+}
+
+void writeViewExr(const View& view, const std::string& path) {
+  requireWritable("writeViewExr", path, view);
+  std::vector<float> linear(view.colour.data.size()), depth(view.depth.size());
+  for (size_t i = 0; i < linear.size(); ++i) linear[i] = linearFromSrgb(view.colour.data[i]);
+  for (size_t i = 0; i < depth.size(); ++i)
+    depth[i] = view.depth[i] > 0 && view.depth[i] < kFarDepth ? view.depth[i] : kNoDepth;
+  writeExr(view.camera,
+           {{"R", linear.data(), 3, true}, {"G", linear.data() + 1, 3, true}, {"B", linear.data() + 2, 3, true},
+            {"Z", depth.data(), 1, false}},
+           path);
 }
 
 }  // namespace vdbc

@@ -24,6 +24,7 @@ struct ReadViewsSettings {
   std::vector<int> frames;  // indices into the folder's frames; empty = all
   int max_side = 0;         // shrink so that the longer side is at most this; 0 = as stored. Colour is
                             // area-averaged, depth takes the nearest sample
+  bool cameras_only = false;  // colour and depth stay empty and need not be there; max_side is not heeded
 };
 
 /// Reads views from: a folder with transforms.json, a transforms.json, an .exr or a folder of .exr
@@ -41,6 +42,22 @@ Eigen::Vector3d conventionalUp(const std::string& path);
 /// A folder that readViews() reads back: transforms.json, PNG colour, 16-bit millimetre depth PNG
 /// (depth beyond 65.534 m becomes none). transforms.json is written last. Throws Error.
 void writeViews(const std::vector<View>& views, const std::string& folder);
+
+/// A channel of an EXR: values[i * stride] of pixel i, row-major from the top. Scene-linear for
+/// colours, metres for Z.
+struct ExrChannel {
+  std::string name;  // R, G, B, A, Z, N.X, ...
+  const float* values = nullptr;
+  size_t stride = 1;
+  bool is_half = true;  // stored as half, else as float
+};
+
+/// Planar Z of a pixel without depth, as Blender writes it.
+constexpr float kNoDepth = 1e10f;
+
+/// One EXR with spec-conforming worldToCamera and worldToNDC. Temporary name, then rename. Throws
+/// Error.
+void writeExr(const Camera& camera, const std::vector<ExrChannel>& channels, const std::string& path);
 
 /// One multi-channel EXR (half RGB scene-linear, float Z planar) with spec-conforming worldToCamera
 /// and worldToNDC; pixels without depth get 1e10. Temporary name, then rename. Throws Error.

@@ -16,8 +16,8 @@
 #include "encoder/network.h"
 #include "encoder/trainer.h"
 #include "encoder/weights.h"
-#include "examples/rooms/rooms.h"
 #include "splat/rasterize_torch.h"
+#include "tests/simple_room.h"
 #include "vdb/frontier.h"
 #include "vdb/scene_volume.h"
 
@@ -30,15 +30,7 @@ namespace fs = std::filesystem;
 
 /// Views of one room, 64 x 48 pixels.
 std::vector<View> roomViews(size_t count) {
-  static const std::vector<View> all = [] {
-    const Room room = makeRoom(42);
-    const RoomRenderer renderer(room);
-    std::mt19937_64 random(42);
-    std::vector<View> v;
-    for (const Camera& camera : randomCameras(room, 16, 64, 48, random))
-      v.push_back(renderer.render(camera, 1, v.size()));
-    return v;
-  }();
+  static const std::vector<View> all = simpleRoomViews(16, 64, 48, 42);
   return {all.begin(), all.begin() + std::ptrdiff_t(count)};
 }
 

@@ -9,22 +9,14 @@
 #include <map>
 #include <set>
 
-#include "examples/rooms/rooms.h"
+#include "tests/simple_room.h"
 #include "vdb/scene_volume.h"
 
 namespace vdbc {
 namespace {
 
 const std::vector<View>& roomViews() {
-  static const std::vector<View> views = [] {
-    const Room room = makeRoom(41);
-    const RoomRenderer renderer(room);
-    std::mt19937_64 random(41);
-    std::vector<View> v;
-    for (const Camera& camera : randomCameras(room, 3, 64, 48, random))
-      v.push_back(renderer.render(camera, 1, v.size()));
-    return v;
-  }();
+  static const std::vector<View> views = simpleRoomViews(3, 64, 48, 41);
   return views;
 }
 

@@ -20,10 +20,10 @@
 #include <thread>
 #include <vector>
 
-#include "examples/rooms/rooms.h"
 #include "splat/gaussian_io.h"
 #include "splat/rasterize.h"
 #include "splat/view.h"
+#include "tests/simple_room.h"
 #include "vdb/error.h"
 #include "vdb/scene_volume.h"
 
@@ -158,18 +158,8 @@ class Program : public ::testing::Test {
     expectFailure(complete(views, more), kFailed, named.empty() ? views : named);
   }
 
-  // Views of a procedural room, small enough to complete in a second.
-  static std::vector<View> roomViews(int count) {
-    const Room room = makeRoom(7);
-    const RoomRenderer renderer(room);
-    std::mt19937_64 random(7);
-    std::vector<View> views;
-    for (const Camera& camera : randomCameras(room, count, 64, 48, random)) {
-      views.push_back(renderer.render(camera, 1, views.size()));
-      views.back().name = std::to_string(views.size() - 1);
-    }
-    return views;
-  }
+  // Views of a room, small enough to complete in a second.
+  static std::vector<View> roomViews(int count) { return simpleRoomViews(count, 64, 48, 7); }
 
   std::string writeRoom(const std::string& name, int count = 2) const {
     writeViews(roomViews(count), at(name));
@@ -291,12 +281,14 @@ TEST_F(Program, InfoIsOneJsonObject) {
 }
 
 TEST_F(Program, EvalRefusesTrainingRooms) {
-  for (const char* seed : {"900000", "1000005", "2099999"})
+  for (const char* seed : {"900000", "1000005", "1099999"})
     expectFailure({"eval", "--scenes", std::string("rooms:") + seed, "--weights", VDBC_WEIGHTS},
                   kFailed, seed);
   expectFailure({"eval", "--scenes", "rooms:899999-900000", "--weights", VDBC_WEIGHTS}, kFailed,
                 "900000");
   expectFailure({"eval", "--scenes", "rooms:one"}, kUsage, "rooms:one");
+  for (const char* option : {"--lpips", "--features"})
+    expectFailure({"eval", "--scenes", "rooms:1", option, at("none.pt")}, kFailed, option);
   expectFailure({"eval", "--scenes", at("missing"), "--weights", VDBC_WEIGHTS}, kFailed,
                 at("missing"));
 }
@@ -572,11 +564,66 @@ TEST_F(Program, RenderShowsTheSplatsFromTheCameras) {
   const Ended points = run({"render", at("pixels.points.vdb"), "--cameras", folder, "--frames", "1",
                             "--width", "32", "-o", output_ + "/small"});
   EXPECT_EQ(points.code, kOk) << points.err;
-  EXPECT_EQ(listing(output_ + "/small"), Args{"0000.png"});
-  const Image small = readImage(output_ + "/small/0000.png");
+  EXPECT_EQ(listing(output_ + "/small"), Args{"0001.png"});  // named by the frame's number
+  const Image small = readImage(output_ + "/small/0001.png");
   EXPECT_EQ(small.width, 32);
   EXPECT_EQ(small.height, 24);
   EXPECT_GT(psnr(small, rasterize(g, resized(views[1].camera, 32, 24), {}).colour), 30);
+}
+
+TEST_F(Program, RenderGoesRoundAndAlong) {
+  const std::string splats = writeSplats(), views = writeRoom("views", 3);
+  const Ended turn = run({"render", splats, "--turntable", "12", "--size", "40", "30", "--fov", "50", "--frames",
+                          "0,10-11", "-o", output_ + "/turn.###.exr", "--preview", "--json"});
+  EXPECT_EQ(turn.code, kOk) << turn.err;
+  EXPECT_EQ(listing(output_), (Args{"turn.000.exr", "turn.000.png", "turn.010.exr", "turn.010.png", "turn.011.exr",
+                                    "turn.011.png"}));
+  ASSERT_EQ(lines(turn.out).size(), 3u);
+  const json said = json::parse(lines(turn.out)[1]);
+  EXPECT_EQ(said.at("frame"), 10);
+  EXPECT_EQ(said.at("image"), output_ + "/turn.010.exr");
+  EXPECT_EQ(said.at("preview"), output_ + "/turn.010.png");
+  EXPECT_NE(turn.err.find("{\"stage\": \"render\", \"percent\": 66"), std::string::npos) << turn.err;
+  EXPECT_EQ(readImage(output_ + "/turn.010.png").width, 40);
+
+  const Ended flight = run({"render", splats, "--cameras", views, "--flythrough", "5", "-o", output_ + "/flight"});
+  EXPECT_EQ(flight.code, kOk) << flight.err;
+  EXPECT_EQ(listing(output_ + "/flight"), (Args{"0000.png", "0001.png", "0002.png", "0003.png", "0004.png"}));
+  const Gaussians g = readPly(splats);
+  const std::vector<View> through = readViews(views);
+  for (size_t i = 0; i < 3; ++i)  // every other frame is a view's
+    EXPECT_GT(psnr(readImage(output_ + "/flight/000" + std::to_string(2 * i) + ".png"),
+                   rasterize(g, through[i].camera, {}).colour), 45);
+}
+
+TEST_F(Program, RenderRefusesContradictions) {
+  const std::string splats = writeSplats(), views = writeRoom("views"), x = output_ + "/####.png";
+  expectFailure({"render", splats, "--turntable", "4", "--cameras", views, "-o", x}, kUsage, "--cameras");
+  expectFailure({"render", splats, "--turntable", "4", "--flythrough", "4", "-o", x}, kUsage, "--flythrough");
+  expectFailure({"render", splats, "--flythrough", "4", "-o", x}, kUsage, "--cameras");
+  expectFailure({"render", splats, "--flythrough", "4", "--cameras", views + "/transforms.json", "--frames", "4", "-o",
+                 x}, kUsage, "--frames");
+  expectFailure({"render", splats, "--turntable", "0", "-o", x}, kUsage, "--turntable");
+  expectFailure({"render", splats, "--turntable", "4", "-o", output_ + "/one.png"}, kUsage, "####");
+  expectFailure({"render", splats, "--turntable", "4", "--preview", "-o", x}, kUsage, "--preview");
+  expectFailure({"render", splats, "--turntable", "4", "--size", "0", "9", "-o", x}, kUsage, "--size");
+  expectFailure({"render", splats, "--turntable", "4", "--fov", "180", "-o", x}, kUsage, "--fov");
+  expectFailure({"render", splats, "--turntable", "4", "--up", "0", "0", "0", "-o", x}, kUsage, "--up");
+  expectFailure({"render", splats, "--turntable", "4", "-o", at("splats.ply") + "/x.####.png"}, kFailed, "splats.ply");
+}
+
+TEST_F(Program, AnInterruptOfRenderLeavesWholeFrames) {
+  const std::string splats = writeSplats();
+  const Ended ended = run({"render", splats, "--turntable", "100000", "--size", "64", "64", "-o",
+                           output_ + "/######.exr", "--json"}, "render");
+  EXPECT_EQ(ended.code, kInterrupted);
+  EXPECT_EQ(lines(ended.err).back(), "vdb_complete: interrupted");
+  const Args files = listing(output_);
+  EXPECT_EQ(lines(ended.out).size(), files.size());
+  for (const std::string& name : files) {
+    EXPECT_EQ(name.size(), 10u) << name;  // 000000.exr, nothing temporary
+    EXPECT_NE(readText(output_ + "/" + name).find("worldToNDC"), std::string::npos);
+  }
 }
 
 TEST_F(Program, CheckFindsCarvedVoxelsInAgreement) {
@@ -624,6 +671,13 @@ TEST_F(Program, EvalPrintsEveryMethodOnce) {
     const json result = json::parse(line);
     ++(result.at("scene") == "mean" ? mean : scene)[result.at("method").get<std::string>()];
     EXPECT_GT(result.at("psnr").get<double>(), 0);
+    EXPECT_GT(result.at("flip").get<double>(), 0);
+    EXPECT_LT(result.at("flip").get<double>(), 1);
+    EXPECT_TRUE(result.at("lpips").is_null());  // no network was given
+    if (result.at("method") != "box") {
+      EXPECT_GT(result.at("depth_rmse_m").get<double>(), result.at("depth_median_m").get<double>());
+      EXPECT_GT(result.at("depth_share").get<double>(), 0);
+    }
   }
   const std::map<std::string, int> once = {
       {"box", 1}, {"completed", 1}, {"nearest", 1}, {"observed", 1}};

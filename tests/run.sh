@@ -4,5 +4,6 @@ set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
 . "$root/examples/setup.sh"
 install_packages
+install_assets
 build all
 ctest --test-dir "$root/build/release" --output-on-failure -j "$(nproc)" "$@"

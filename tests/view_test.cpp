@@ -252,6 +252,33 @@ TEST_F(ViewFile, ExtensionsMayBeLeftOut) {
   EXPECT_EQ(readJson(json)[0].name, "./a");
 }
 
+TEST_F(ViewFile, CamerasAloneNeedNoPictures) {
+  const std::vector<View> views = {someView(1, 8, 6), someView(2, 8, 6)};
+  writeViews(views, path("whole"));
+  ReadViewsSettings settings;
+  settings.cameras_only = true;
+  fs::create_directories(path("bare"));
+  fs::copy(path("whole/transforms.json"), path("bare/transforms.json"));
+  for (const char* folder : {"whole", "bare"}) {
+    const std::vector<View> cameras = readViews(path(folder), settings);
+    const std::vector<View> expected = readViews(path("whole"));
+    ASSERT_EQ(cameras.size(), 2u);
+    for (size_t i = 0; i < 2; ++i) {
+      EXPECT_EQ(cameras[i].camera.world_from_camera.matrix(), expected[i].camera.world_from_camera.matrix());
+      EXPECT_EQ(cameras[i].camera.width, 8);
+      EXPECT_EQ(cameras[i].camera.height, 6);
+      EXPECT_EQ(cameras[i].camera.fx, expected[i].camera.fx);
+      EXPECT_EQ(cameras[i].name, expected[i].name);
+      EXPECT_TRUE(cameras[i].colour.data.empty() && cameras[i].depth.empty());
+    }
+  }
+  EXPECT_THROW(readViews(path("bare")), Error);
+  const std::vector<float> alpha(48, 0.5f);
+  writeExr(views[0].camera, {{"A", alpha.data(), 1, true}}, path("alpha.exr"));
+  EXPECT_THROW(readViews(path("alpha.exr")), Error);
+  EXPECT_NEAR(readViews(path("alpha.exr"), settings)[0].camera.fx, views[0].camera.fx, 1e-3);
+}
+
 TEST_F(ViewFile, FramesAreSelectedInTheOrderAskedFor) {
   writeViews({someView(1), someView(2), someView(3)}, path("c"));
   ReadViewsSettings settings;

@@ -1,11 +1,15 @@
-// make_rooms: procedural rooms as folders of RGB-D views, with their true surface as a mesh.
-// FOLDER/SEED/{transforms.json,color,depth,mesh.ply} and FOLDER/sheet.png, a picture of each room.
+// make_rooms: furnished rooms as folders of RGB-D views with their truth, the example homes, contact
+// sheets and statistics.
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <cstdio>
 #include <exception>
 #include <filesystem>
+#include <map>
+#include <nlohmann/json.hpp>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -17,22 +21,26 @@ namespace vdbc {
 namespace {
 
 namespace fs = std::filesystem;
+using Eigen::Vector3f;
+using nlohmann::ordered_json;
 
 constexpr uint64_t kMaxRooms = 100000;
 constexpr int kTileSide = 224, kSheetColumns = 6;
+constexpr float kTruthVoxel = .1f;  // metres
 
 struct Options {
   std::string seeds, output;
-  int views = 8, samples = 16;
+  int views = 8, samples = kRoomSamples;
   std::vector<int> size{224};  // width, or width and height
+  bool truth = false, aovs = false;
 };
 
-struct SeedRange {
+struct Range {
   uint64_t first = 0, last = 0;
 };
 
 // "A" or "A-B".
-SeedRange seedRange(const std::string& text) {
+Range rangeOf(const std::string& option, const std::string& text) {
   unsigned long long first = 0, last = 0;
   int used = 0;
   const bool digits = !text.empty() && text.find_first_not_of("0123456789-") == std::string::npos &&
@@ -41,23 +49,12 @@ SeedRange seedRange(const std::string& text) {
       digits ? std::sscanf(text.c_str(), "%llu%n-%llu%n", &first, &used, &last, &used) : 0;
   if (found == 1) last = first;
   if (found < 1 || size_t(used) != text.size() || last < first || last - first >= kMaxRooms)
-    throw UsageError(joinText("--seeds: ", text, ": expected a seed or a range such as 10-19"));
+    throw UsageError(joinText(option, ": ", text, ": expected a number or a range such as 10-19"));
   return {first, last};
 }
 
-// Binary PLY, world frame, metres.
-void writeMesh(const TriangleMesh& mesh, const std::string& path) {
-  std::string bytes =
-      joinText("ply\nformat binary_little_endian 1.0\nelement vertex ", mesh.vertices.size(),
-               "\nproperty float x\nproperty float y\nproperty float z\nelement face ",
-               mesh.triangles.size(), "\nproperty list uchar int vertex_indices\nend_header\n");
-  for (const Eigen::Vector3f& v : mesh.vertices)
-    bytes.append(reinterpret_cast<const char*>(v.data()), 3 * sizeof(float));
-  for (const Eigen::Vector3i& t : mesh.triangles) {
-    bytes.push_back(3);
-    bytes.append(reinterpret_cast<const char*>(t.data()), 3 * sizeof(int32_t));
-  }
-  writeFile("make_rooms", path, bytes.data(), bytes.size());
+double secondsSince(std::chrono::steady_clock::time_point start) {
+  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
 }
 
 void paste(const Image& from, int x0, int y0, Image* to) {
@@ -66,9 +63,10 @@ void paste(const Image& from, int x0, int y0, Image* to) {
       for (int c = 0; c < 3; ++c) to->at(x0 + x, y0 + y, c) = from.at(x, y, c);
 }
 
-// One picture a room, in rows.
-Image contactSheet(const std::vector<Image>& pictures) {
-  const int count = int(pictures.size()), columns = std::min(count, kSheetColumns);
+// One picture a tile, in rows.
+Image contactSheet(const std::vector<Image>& pictures, int columns) {
+  const int count = int(pictures.size());
+  columns = std::min(count, columns);
   const int rows = (count + columns - 1) / columns, w = pictures[0].width, h = pictures[0].height;
   Image sheet(columns * w, rows * h, 3, .15f);
   for (int i = 0; i < count; ++i)
@@ -76,55 +74,235 @@ Image contactSheet(const std::vector<Image>& pictures) {
   return sheet;
 }
 
-void run(const Options& o) {
-  const SeedRange seeds = seedRange(o.seeds);
-  const int width = o.size.front(), height = o.size.back();
-  std::vector<Image> pictures;
-  for (uint64_t seed = seeds.first;; ++seed) {
-    const Room room = makeRoom(seed);
-    const RoomRenderer renderer(room);
-    std::mt19937_64 random(seed);
-    std::vector<View> views;
-    for (const Camera& camera : randomCameras(room, o.views, width, height, random))
-      views.push_back(renderer.render(camera, o.samples, seed + views.size()));
-    const std::string folder = o.output + "/" + std::to_string(seed);
-    writeViews(views, folder);
-    writeMesh(room.mesh, folder + "/mesh.ply");
-    const int tile_height = std::max(1, int(std::lround(double(kTileSide) * height / width)));
-    pictures.push_back(resizeImage(views[0].colour, kTileSide, tile_height));
-    if (seed == seeds.last) break;  // the last seed may be the largest there is
-  }
-  writePng(contactSheet(pictures), o.output + "/sheet.png");
+void writeAovs(const RoomPicture& p, const std::string& path) {
+  std::vector<float> depth = p.view.depth, material(p.material.begin(), p.material.end());
+  for (float& z : depth)
+    if (!(z > 0)) z = kNoDepth;
+  const float *c = p.radiance.data.data(), *n = p.normal.data.data();
+  writeExr(p.view.camera,
+           {{"R", c, 3, true}, {"G", c + 1, 3, true}, {"B", c + 2, 3, true},
+            {"N.X", n, 3, true}, {"N.Y", n + 1, 3, true}, {"N.Z", n + 2, 3, true},
+            {"Z", depth.data(), 1, false}, {"material", material.data(), 1, false}},
+           path);
 }
 
-}  // namespace
-}  // namespace vdbc
+// FOLDER/{transforms.json, color, depth} and what the options add; returns the sheet's picture.
+Image writeRoom(const Room& room, uint64_t seed, const Options& o, const std::string& folder) {
+  const int width = o.size.front(), height = o.size.back();
+  const RoomRenderer renderer(room);
+  const std::vector<View> views = roomViews(room, renderer, o.views, width, height, o.samples, seed);
+  writeViews(views, folder);
+  if (o.truth) {
+    writeMesh(solidMesh(room.surface), folder + "/mesh.ply");
+    writeTruth(room, roomTruth(room, kTruthVoxel), folder + "/truth.vdb");
+  }
+  for (size_t i = 0; o.aovs && i < views.size(); ++i) {
+    char name[32];
+    std::snprintf(name, sizeof name, "/aovs.%04zu.exr", i);
+    writeAovs(renderer.picture(views[i].camera, o.samples, seed + i), folder + name);
+  }
+  const int tile_height = std::max(1, int(std::lround(double(kTileSide) * height / width)));
+  return resizeImage(views[0].colour, kTileSide, tile_height);
+}
 
-int main(int argc, char** argv) {
-  vdbc::Options o;
-  CLI::App app{"Procedural rooms as folders of RGB-D views with their true surface.", "make_rooms"};
-  app.add_option("--seeds", o.seeds, "the rooms, A-B; the same seed gives the same room")
-      ->required();
-  app.add_option("--views", o.views, "pictures a room")
-      ->check(CLI::Range(1, 1000))
-      ->capture_default_str();
-  app.add_option("-o,--output", o.output,
-                 "folder for SEED/transforms.json, SEED/mesh.ply and sheet.png")
-      ->required();
-  app.add_option("--size", o.size, "pixels: width, or width and height")
-      ->expected(1, 2)
-      ->check(CLI::Range(8, 4096))
-      ->capture_default_str();
-  app.add_option("--samples", o.samples, "render samples a pixel")
-      ->check(CLI::Range(1, 4096))
-      ->capture_default_str();
+void finishSheet(const std::vector<Image>& pictures, const std::string& folder) {
+  writePng(contactSheet(pictures, kSheetColumns), folder + "/sheet.png");
+}
+
+void makeRooms(const AssetLibrary& assets, const Options& o) {
+  const Range seeds = rangeOf("--seeds", o.seeds);
+  std::vector<Image> pictures;
+  for (uint64_t seed = seeds.first;; ++seed) {
+    const std::string folder = o.output + "/" + std::to_string(seed);
+    // transforms.json is written last: a run that was stopped goes on where it was.
+    if (fs::exists(folder + "/transforms.json"))
+      std::fprintf(stderr, "make_rooms: %s is there already\n", folder.c_str());
+    else
+      pictures.push_back(writeRoom(makeRoom(assets, seed), seed, o, folder));
+    if (seed == seeds.last) break;  // the last seed may be the largest there is
+  }
+  if (!pictures.empty()) finishSheet(pictures, o.output);
+}
+
+void makeHomes(const AssetLibrary& assets, const Options& o) {
+  std::vector<Image> pictures;
+  const int count = homeRoomCount(assets);
+  for (int i = 0; i < count; ++i)
+    pictures.push_back(writeRoom(homeRoom(assets, i), uint64_t(i), o, o.output + "/" + std::to_string(i)));
+  finishSheet(pictures, o.output);
+}
+
+// --- models ---------------------------------------------------------------------------------------
+
+void addQuad(const std::array<Vector3f, 4>& p, SurfaceMesh* s) {
+  const int first = int(s->mesh.vertices.size());
+  s->mesh.vertices.insert(s->mesh.vertices.end(), p.begin(), p.end());
+  for (int k : {1, 2}) {
+    s->mesh.triangles.emplace_back(first, first + k, first + k + 1);
+    s->material.push_back(0);
+    s->uv.push_back({Eigen::Vector2f::Zero(), Eigen::Vector2f::Zero(), Eigen::Vector2f::Zero()});
+    s->normal.push_back({Vector3f::Zero(), Vector3f::Zero(), Vector3f::Zero()});
+  }
+}
+
+// A model scaled to a unit box, in a corner of white walls under one lamp, seen from its front right.
+Image modelPicture(const AssetLibrary& assets, size_t model, int side) {
+  Room room;
+  room.name = assets.models()[model].id;
+  room.surface.materials.push_back({});
+  room.surface.materials[0].colour_a.setConstant(.7f);
+  addQuad({Vector3f(-2, -2, 0), Vector3f(2, -2, 0), Vector3f(2, 2, 0), Vector3f(-2, 2, 0)}, &room.surface);
+  addQuad({Vector3f(-2, -1, 0), Vector3f(-2, -1, 3), Vector3f(2, -1, 3), Vector3f(2, -1, 0)}, &room.surface);
+  addQuad({Vector3f(-1, -2, 0), Vector3f(-1, 2, 0), Vector3f(-1, 2, 3), Vector3f(-1, -2, 3)}, &room.surface);
+  const float scale = 1 / assets.models()[model].size_m.maxCoeff();
+  room.surface.append(*assets.mesh(model), Eigen::Affine3f(Eigen::Scaling(scale)));
+  room.floor = {{-2, -2}, {2, -2}, {2, 2}, {-2, 2}};
+  room.ceilings = {{0, 0, 3}};
+  RoomLight lamp;
+  lamp.centre = Vector3f(1.4f, 1.8f, 2.6f), lamp.radius_m = .35f, lamp.radiance.setConstant(20);
+  room.lights.push_back(lamp);
+  Camera camera;
+  camera.width = camera.height = side;
+  camera.fx = camera.fy = 1.7 * side;
+  camera.cx = camera.cy = side / 2.;
+  const Eigen::Vector3d eye(1.5, 2.2, 1.5), forward = (Eigen::Vector3d(0, 0, .42) - eye).normalized();
+  const Eigen::Vector3d right = forward.cross(Eigen::Vector3d::UnitZ()).normalized();
+  camera.world_from_camera.linear() << right, forward.cross(right), forward;
+  camera.world_from_camera.translation() = eye;
+  return RoomRenderer(room).render(camera, 16, 1).colour;
+}
+
+void makeModelSheet(const AssetLibrary& assets, const std::string& path) {
+  constexpr int kSide = 96, kColumns = 30;
+  std::vector<Image> pictures;
+  for (size_t i = 0; i < assets.models().size(); ++i) {
+    const ModelInfo& m = assets.models()[i];
+    if (m.role != "none" && m.fault.empty()) pictures.push_back(modelPicture(assets, i, kSide));
+  }
+  require(!pictures.empty(), "make_rooms models: expected usable models, found none");
+  writePng(contactSheet(pictures, kColumns), path);
+  std::printf("%zu models\n", pictures.size());
+}
+
+// --- statistics -----------------------------------------------------------------------------------
+
+double floorArea(const Room& room) {
+  double twice = 0;
+  for (size_t i = 0, j = room.floor.size() - 1; i < room.floor.size(); j = i++)
+    twice += double(room.floor[j].x()) * room.floor[i].y() - double(room.floor[i].x()) * room.floor[j].y();
+  return twice / 2;
+}
+
+// Share of the room's own voxels (F or E in truth) that the first `count` views leave F, E and U.
+ordered_json seenShares(const RoomTruth& truth, const std::vector<View>& views, int count) {
+  std::vector<DepthView> depth;
+  for (int i = 0; i < count; ++i) depth.push_back(views[size_t(i)].depthView());
+  Progress silent;
+  const ObservedSpace seen = carve(truth.frame, depth, CarveSettings(), silent);
+  std::array<int64_t, 3> counts = {0, 0, 0};
+  for (auto c = truth.frame.bounds.begin(); c; ++c)
+    if (truth.space.filled.isValueOn(*c) || truth.space.empty.isValueOn(*c))
+      ++counts[seen.filled.isValueOn(*c) ? 0 : seen.empty.isValueOn(*c) ? 1 : 2];
+  const double all = double(counts[0] + counts[1] + counts[2]);
+  return {{"F", double(counts[0]) / all}, {"E", double(counts[1]) / all}, {"U", double(counts[2]) / all}};
+}
+
+struct Totals {
+  std::map<std::string, int> kinds;
+  std::set<std::string> models;
+  std::map<std::string, std::vector<double>> values;
+};
+
+ordered_json statisticsOf(const AssetLibrary& assets, uint64_t seed, Totals* totals) {
+  constexpr int kViews = 12, kSide = 224;
+  const auto start = std::chrono::steady_clock::now();
+  const Room room = makeRoom(assets, seed);
+  const double seconds = secondsSince(start);
+  const RoomRenderer renderer(room);
+  const RayTarget& solid = renderer.rayTarget();
+  std::mt19937_64 random(seed);
+  std::vector<Camera> cameras =
+      coveringCameras(solid, randomCameras(room, solid, 4 * kViews, kSide, kSide, random), kViews);
+  for (size_t i = cameras.size(); i-- > 1;) std::swap(cameras[i], cameras[random() % (i + 1)]);
+  std::vector<View> views;
+  for (const Camera& c : cameras) views.push_back(renderer.renderDepth(c));
+  const RoomTruth truth = roomTruth(room, kTruthVoxel);
+  std::set<std::string> models;
+  int placed = 0;
+  for (const Piece& p : room.pieces)
+    if (!p.model.empty()) models.insert(p.model), ++placed;
+  ++totals->kinds[room.kind];
+  totals->models.insert(models.begin(), models.end());
+  ordered_json j{{"room", room.name}, {"kind", room.kind},
+                 {"l_shaped", room.floor.size() > 4 ? 1. : 0.}, {"sloped", room.ceilings.size() > 1 ? 1. : 0.},
+                 {"floor_m2", floorArea(room)}, {"objects", double(placed)}, {"models", double(models.size())},
+                 {"triangles", double(room.surface.mesh.triangles.size())}, {"seconds", seconds}};
+  for (int count : {2, kViews})
+    for (const auto& [state, share] : seenShares(truth, views, count).items())
+      j[state + "_" + std::to_string(count)] = share;
+  for (const auto& [key, value] : j.items())
+    if (value.is_number()) totals->values[key].push_back(value.get<double>());
+  return j;
+}
+
+// One JSON line a room, and one of all of them: mean, least and most.
+void printStatistics(const AssetLibrary& assets, const Options& o) {
+  const Range seeds = rangeOf("--seeds", o.seeds);
+  Totals totals;
+  for (uint64_t seed = seeds.first;; ++seed) {
+    std::printf("%s\n", statisticsOf(assets, seed, &totals).dump().c_str());
+    std::fflush(stdout);
+    if (seed == seeds.last) break;
+  }
+  ordered_json all{{"rooms", seeds.last - seeds.first + 1}, {"models_used", totals.models.size()}, {"kinds", totals.kinds}};
+  for (auto& [key, values] : totals.values) {
+    const auto [least, most] = std::minmax_element(values.begin(), values.end());
+    double sum = 0;
+    for (double v : values) sum += v;
+    all[key] = {{"mean", sum / double(values.size())}, {"min", *least}, {"max", *most}};
+  }
+  std::printf("%s\n", all.dump().c_str());
+}
+
+// --- program --------------------------------------------------------------------------------------
+
+void addPictures(CLI::App* verb, Options* o) {
+  verb->add_option("--views", o->views, "pictures a room")->check(CLI::Range(1, 1000))->capture_default_str();
+  verb->add_option("--size", o->size, "pixels: width, or width and height")
+      ->expected(1, 2)->check(CLI::Range(8, 4096))->capture_default_str();
+  verb->add_option("--samples", o->samples, "paths a pixel")->check(CLI::Range(1, 65536))->capture_default_str();
+  verb->add_flag("--truth", o->truth, "mesh.ply and truth.vdb of each room too");
+  verb->add_flag("--aovs", o->aovs, "aovs.####.exr too: scene-linear colour, normal, Z, material");
+}
+
+int run(int argc, char** argv) {
+  Options o;
+  CLI::App app{"Furnished rooms from Sweet Home 3D's Debian packages, path-traced.", "make_rooms"};
+  app.require_subcommand(1);
+  CLI::App* rooms = app.add_subcommand("rooms", "furnished rooms: OUTPUT/SEED/transforms.json, ... and OUTPUT/sheet.png");
+  rooms->add_option("--seeds", o.seeds, joinText("which, A-B; from ", kFirstTrainingSeed, " on with training models"))->required();
+  CLI::App* homes = app.add_subcommand("homes", "the rooms of the nine example homes, likewise");
+  CLI::App* models = app.add_subcommand("models", "contact sheet (PNG) of all usable models");
+  CLI::App* statistics = app.add_subcommand("statistics", "one JSON line a room: contents, and what views see of it");
+  statistics->add_option("--seeds", o.seeds, "which rooms, A-B")->required();
+  CLI::App* credits = app.add_subcommand("attribution", "creators and licences of all usable models (Markdown)");
+  CLI::App* table = app.add_subcommand("table", "models.tsv anew: split, role and fault of every model");
+  for (CLI::App* verb : {rooms, homes}) addPictures(verb, &o);
+  for (CLI::App* verb : {rooms, homes, models})
+    verb->add_option("-o,--output", o.output, verb == models ? "PNG to write" : "folder to write")->required();
   try {
     app.parse(argc, argv);
-    vdbc::run(o);
+    const AssetLibrary assets = AssetLibrary::open();
+    if (*rooms) makeRooms(assets, o);
+    if (*homes) makeHomes(assets, o);
+    if (*models) makeModelSheet(assets, o.output);
+    if (*statistics) printStatistics(assets, o);
+    if (*credits) std::printf("%s", attribution(assets).c_str());
+    if (*table) std::printf("%s", modelTable(assets).c_str());
     return 0;
   } catch (const CLI::ParseError& e) {
     return app.exit(e) == 0 ? 0 : 2;
-  } catch (const vdbc::UsageError& e) {
+  } catch (const UsageError& e) {
     std::fprintf(stderr, "make_rooms: %s\n", e.what());
     return 2;
   } catch (const std::exception& e) {
@@ -132,3 +310,8 @@ int main(int argc, char** argv) {
     return 1;
   }
 }
+
+}  // namespace
+}  // namespace vdbc
+
+int main(int argc, char** argv) { return vdbc::run(argc, argv); }

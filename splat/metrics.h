@@ -1,0 +1,40 @@
+#pragma once
+// How far images or their depth are from the true ones: FLIP, depth error, distances between sets
+// of features (PSNR and SSIM: image.h).
+#include <Eigen/Core>
+#include <vector>
+
+#include "splat/image.h"
+
+namespace vdbc {
+
+/// FLIP's default viewer: 0.7 m from a monitor with 3840 pixels on 0.7 m.
+constexpr double kFlipPixelsPerDegree = 3840 * 3.14159265358979323846 / 180;
+
+/// The FLIP error of each pixel, [H, W, 1] in 0-1 (Andersson et al. 2020, for low dynamic range):
+/// what a viewer notices who alternates between the two. Both are [H, W, 3] display sRGB, clamped
+/// to 0-1; NaN counts as 0. Symmetric; 0 for equal images.
+Image flipMap(const Image& reference, const Image& test,
+              double pixels_per_degree = kFlipPixelsPerDegree);
+/// Mean of flipMap().
+double flip(const Image& reference, const Image& test,
+            double pixels_per_degree = kFlipPixelsPerDegree);
+
+/// Over the pixels where both depths are positive and finite; NaN where there are none.
+struct DepthError {
+  double median_abs_m = 0;  // lower median of |depth - truth|, metres
+  double rmse_m = 0;        // root of the mean square, metres
+  double share = 0;         // of the pixels with a true depth: those that have one here too
+};
+/// Planar depths of the same pixels, metres; 0 where there is none.
+DepthError depthError(const std::vector<float>& depth, const std::vector<float>& truth);
+
+/// Between the features of two sets of images, one row an image, at least two rows each: of
+/// Gaussians fitted to them (FID if the network is its Inception, Heusel et al. 2017), |mean_a -
+/// mean_b|^2 + tr(cov_a + cov_b - 2 (cov_a cov_b)^(1/2)). Biased upwards for few images.
+double frechetDistance(const Eigen::MatrixXd& a, const Eigen::MatrixXd& b);
+/// The same by the unbiased squared maximum mean discrepancy with the kernel (x y / columns + 1)^3
+/// (KID, Binkowski et al. 2018). May be below 0 for sets alike.
+double kernelDistance(const Eigen::MatrixXd& a, const Eigen::MatrixXd& b);
+
+}  // namespace vdbc
