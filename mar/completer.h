@@ -33,7 +33,7 @@ struct CompleterConfig {
 };
 
 struct CompleteSettings {
-  float tau = .1f;           // a token is kept if its occupancy probability exceeds this
+  float tau = .15f;           // a token is kept if its occupancy probability exceeds this
   float coarse_tau = .05f;   // the coarse stage's gate: high recall
   Neighbours neighbours = Neighbours::kCorners26;
   int sampling_steps = 0;    // DDIM steps of the diffusion head; 0: its linear mean

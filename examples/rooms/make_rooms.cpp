@@ -10,6 +10,7 @@
 #include <map>
 #include <nlohmann/json.hpp>
 #include <set>
+#include <sstream>
 #include <string>
 #include <vector>
 
@@ -25,7 +26,7 @@ using Eigen::Vector3f;
 using nlohmann::ordered_json;
 
 constexpr uint64_t kMaxRooms = 100000;
-constexpr int kTileSide = 224, kSheetColumns = 6;
+constexpr int kTileSide = 128, kSheetColumns = 8;
 constexpr float kTruthVoxel = .1f;  // metres
 
 struct Options {
@@ -35,22 +36,24 @@ struct Options {
   bool truth = false, aovs = false;
 };
 
-struct Range {
-  uint64_t first = 0, last = 0;
-};
-
-// "A" or "A-B".
-Range rangeOf(const std::string& option, const std::string& text) {
-  unsigned long long first = 0, last = 0;
-  int used = 0;
-  const bool digits = !text.empty() && text.find_first_not_of("0123456789-") == std::string::npos &&
-                      text.front() != '-';
-  const int found =
-      digits ? std::sscanf(text.c_str(), "%llu%n-%llu%n", &first, &used, &last, &used) : 0;
-  if (found == 1) last = first;
-  if (found < 1 || size_t(used) != text.size() || last < first || last - first >= kMaxRooms)
-    throw UsageError(joinText(option, ": ", text, ": expected a number or a range such as 10-19"));
-  return {first, last};
+// "3,10-19": seeds in the order given.
+std::vector<uint64_t> seedList(const std::string& text) {
+  std::vector<uint64_t> seeds;
+  std::stringstream parts(text);
+  for (std::string part; std::getline(parts, part, ',');) {
+    unsigned long long first = 0, last = 0;
+    int used = 0;
+    const bool digits = !part.empty() && part.find_first_not_of("0123456789-") == std::string::npos &&
+                        part.front() != '-';
+    const int found =
+        digits ? std::sscanf(part.c_str(), "%llu%n-%llu%n", &first, &used, &last, &used) : 0;
+    if (found == 1) last = first;
+    if (found < 1 || size_t(used) != part.size() || last < first || last - first >= kMaxRooms)
+      throw UsageError(joinText("--seeds: ", text, ": expected numbers and ranges such as 3,10-19"));
+    for (uint64_t i = 0; i <= last - first; ++i) seeds.push_back(first + i);
+  }
+  if (seeds.empty()) throw UsageError("--seeds: expected numbers and ranges such as 3,10-19, found nothing");
+  return seeds;
 }
 
 double secondsSince(std::chrono::steady_clock::time_point start) {
@@ -101,35 +104,46 @@ Image writeRoom(const Room& room, uint64_t seed, const Options& o, const std::st
     std::snprintf(name, sizeof name, "/aovs.%04zu.exr", i);
     writeAovs(renderer.picture(views[i].camera, o.samples, seed + i), folder + name);
   }
-  const int tile_height = std::max(1, int(std::lround(double(kTileSide) * height / width)));
-  return resizeImage(views[0].colour, kTileSide, tile_height);
+  return views[0].colour;
 }
 
-void finishSheet(const std::vector<Image>& pictures, const std::string& folder) {
-  writePng(contactSheet(pictures, kSheetColumns), folder + "/sheet.png");
+// transforms.json is written last: a run that was stopped goes on where it was.
+bool isWritten(const std::string& folder) { return fs::exists(folder + "/transforms.json"); }
+
+// The first picture of a room that an earlier run wrote.
+Image firstPicture(const std::string& folder) {
+  ReadViewsSettings first;
+  first.frames = {0};
+  return readViews(folder, first)[0].colour;
+}
+
+void writeSheet(const std::vector<Image>& pictures, const std::string& folder) {
+  const Image& first = pictures[0];
+  const int tile_height = std::max(1, int(std::lround(double(kTileSide) * first.height / first.width)));
+  std::vector<Image> tiles;
+  for (const Image& picture : pictures) tiles.push_back(resizeImage(picture, kTileSide, tile_height));
+  writePng(contactSheet(tiles, kSheetColumns), folder + "/sheet.png");
 }
 
 void makeRooms(const AssetLibrary& assets, const Options& o) {
-  const Range seeds = rangeOf("--seeds", o.seeds);
   std::vector<Image> pictures;
-  for (uint64_t seed = seeds.first;; ++seed) {
+  for (uint64_t seed : seedList(o.seeds)) {
     const std::string folder = o.output + "/" + std::to_string(seed);
-    // transforms.json is written last: a run that was stopped goes on where it was.
-    if (fs::exists(folder + "/transforms.json"))
-      std::fprintf(stderr, "make_rooms: %s is there already\n", folder.c_str());
-    else
-      pictures.push_back(writeRoom(makeRoom(assets, seed), seed, o, folder));
-    if (seed == seeds.last) break;  // the last seed may be the largest there is
+    pictures.push_back(isWritten(folder) ? firstPicture(folder)
+                                         : writeRoom(makeRoom(assets, seed), seed, o, folder));
   }
-  if (!pictures.empty()) finishSheet(pictures, o.output);
+  writeSheet(pictures, o.output);
 }
 
 void makeHomes(const AssetLibrary& assets, const Options& o) {
   std::vector<Image> pictures;
   const int count = homeRoomCount(assets);
-  for (int i = 0; i < count; ++i)
-    pictures.push_back(writeRoom(homeRoom(assets, i), uint64_t(i), o, o.output + "/" + std::to_string(i)));
-  finishSheet(pictures, o.output);
+  for (int i = 0; i < count; ++i) {
+    const std::string folder = o.output + "/" + std::to_string(i);
+    pictures.push_back(isWritten(folder) ? firstPicture(folder)
+                                         : writeRoom(homeRoom(assets, i), uint64_t(i), o, folder));
+  }
+  writeSheet(pictures, o.output);
 }
 
 // --- models ---------------------------------------------------------------------------------------
@@ -237,9 +251,10 @@ ordered_json statisticsOf(const AssetLibrary& assets, uint64_t seed, Totals* tot
                  {"l_shaped", room.floor.size() > 4 ? 1. : 0.}, {"sloped", room.ceilings.size() > 1 ? 1. : 0.},
                  {"floor_m2", floorArea(room)}, {"objects", double(placed)}, {"models", double(models.size())},
                  {"triangles", double(room.surface.mesh.triangles.size())}, {"seconds", seconds}};
-  for (int count : {2, kViews})
-    for (const auto& [state, share] : seenShares(truth, views, count).items())
-      j[state + "_" + std::to_string(count)] = share;
+  for (int count : {2, kViews}) {
+    const ordered_json shares = seenShares(truth, views, count);
+    for (const auto& [state, share] : shares.items()) j[state + "_" + std::to_string(count)] = share;
+  }
   for (const auto& [key, value] : j.items())
     if (value.is_number()) totals->values[key].push_back(value.get<double>());
   return j;
@@ -247,14 +262,13 @@ ordered_json statisticsOf(const AssetLibrary& assets, uint64_t seed, Totals* tot
 
 // One JSON line a room, and one of all of them: mean, least and most.
 void printStatistics(const AssetLibrary& assets, const Options& o) {
-  const Range seeds = rangeOf("--seeds", o.seeds);
+  const std::vector<uint64_t> seeds = seedList(o.seeds);
   Totals totals;
-  for (uint64_t seed = seeds.first;; ++seed) {
+  for (uint64_t seed : seeds) {
     std::printf("%s\n", statisticsOf(assets, seed, &totals).dump().c_str());
     std::fflush(stdout);
-    if (seed == seeds.last) break;
   }
-  ordered_json all{{"rooms", seeds.last - seeds.first + 1}, {"models_used", totals.models.size()}, {"kinds", totals.kinds}};
+  ordered_json all{{"rooms", seeds.size()}, {"models_used", totals.models.size()}, {"kinds", totals.kinds}};
   for (auto& [key, values] : totals.values) {
     const auto [least, most] = std::minmax_element(values.begin(), values.end());
     double sum = 0;
@@ -280,11 +294,11 @@ int run(int argc, char** argv) {
   CLI::App app{"Furnished rooms from Sweet Home 3D's Debian packages, path-traced.", "make_rooms"};
   app.require_subcommand(1);
   CLI::App* rooms = app.add_subcommand("rooms", "furnished rooms: OUTPUT/SEED/transforms.json, ... and OUTPUT/sheet.png");
-  rooms->add_option("--seeds", o.seeds, joinText("which, A-B; from ", kFirstTrainingSeed, " on with training models"))->required();
+  rooms->add_option("--seeds", o.seeds, joinText("which, 3,10-19 say; from ", kFirstTrainingSeed, " on with training models"))->required();
   CLI::App* homes = app.add_subcommand("homes", "the rooms of the nine example homes, likewise");
   CLI::App* models = app.add_subcommand("models", "contact sheet (PNG) of all usable models");
   CLI::App* statistics = app.add_subcommand("statistics", "one JSON line a room: contents, and what views see of it");
-  statistics->add_option("--seeds", o.seeds, "which rooms, A-B")->required();
+  statistics->add_option("--seeds", o.seeds, "which rooms, 3,10-19 say")->required();
   CLI::App* credits = app.add_subcommand("attribution", "creators and licences of all usable models (Markdown)");
   CLI::App* table = app.add_subcommand("table", "models.tsv anew: split, role and fault of every model");
   for (CLI::App* verb : {rooms, homes}) addPictures(verb, &o);
