@@ -117,8 +117,8 @@ class RoomRenderer {
   std::unique_ptr<Impl> impl_;
 };
 
-/// Samples a pixel: 30 dB or more against 4,096 in most views of 224 x 224 (docs/rooms.md).
-constexpr int kRoomSamples = 12;
+/// Samples a pixel: 30 dB or more against 4,096 in most rooms at 224 x 224 (docs/rooms.md).
+constexpr int kRoomSamples = 8;
 
 /// `count` pictures of a room from the covering ones of four times as many random cameras, in random
 /// order: any first n of them are a random choice. The same for the same seed.
