@@ -6,6 +6,7 @@
 #include <cmath>
 #include <set>
 
+#include "examples/rooms/floor_plan.h"
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
 
@@ -47,17 +48,6 @@ std::string role(const Piece& piece) {
 }
 
 bool isFlat(const Piece& piece) { return piece.box.sizes().z() < .02f; }
-
-bool isInside(const std::vector<Vector2f>& outline, const Vector2f& p) {
-  bool inside = false;
-  for (size_t i = 0, j = outline.size() - 1; i < outline.size(); j = i++) {
-    const Vector2f &a = outline[i], &b = outline[j];
-    if ((a.y() > p.y()) != (b.y() > p.y()) &&
-        p.x() < (b.x() - a.x()) * (p.y() - a.y()) / (b.y() - a.y()) + a.x())
-      inside = !inside;
-  }
-  return inside;
-}
 
 /// The box of a piece in its own axes: a corner and three edges, room frame.
 struct Oriented {

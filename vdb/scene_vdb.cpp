@@ -34,20 +34,6 @@ constexpr const char* kVoxelM = "voxel_m";
 constexpr const char* kVolumeMin = "volume_min";
 constexpr const char* kVolumeMax = "volume_max";
 
-/// The frame as OpenVDB has it: row vectors, voxel centres at whole indices.
-openvdb::math::Transform::Ptr fileTransform(const VoxelFrame& frame) {
-  const Matrix3d scaled = frame.world_from_grid.linear() * double(frame.voxel_m);
-  const Vector3d centre = frame.toWorld(Vector3d::Constant(0.5));
-  openvdb::Mat4d m = openvdb::Mat4d::identity();
-  for (int row = 0; row < 3; ++row) {
-    for (int col = 0; col < 3; ++col) m[row][col] = scaled(col, row);
-    m[3][row] = centre[row];
-  }
-  // simplify(): without rotation it is a plain scale and translation, which more tools understand.
-  return std::make_shared<openvdb::math::Transform>(
-      openvdb::math::simplify(std::make_shared<openvdb::math::AffineMap>(m)));
-}
-
 /// The frame of a file's transform; throws unless that is a rotation, translation and uniform
 /// scale.
 VoxelFrame frameOf(const openvdb::math::Transform& transform, float voxel_m,
@@ -247,6 +233,20 @@ Value findMetadata(const openvdb::MetaMap& metadata, const char* name, const std
 }
 
 }  // namespace
+
+openvdb::math::Transform::Ptr fileTransform(const VoxelFrame& frame, int level) {
+  const double edge = double(frame.voxel_m) * (1 << level);
+  const Matrix3d scaled = frame.world_from_grid.linear() * edge;
+  const Vector3d centre = frame.toWorld(Vector3d::Constant(0.5 * (1 << level)));
+  openvdb::Mat4d m = openvdb::Mat4d::identity();
+  for (int row = 0; row < 3; ++row) {
+    for (int col = 0; col < 3; ++col) m[row][col] = scaled(col, row);
+    m[3][row] = centre[row];
+  }
+  // simplify(): without rotation it is a plain scale and translation, which more tools understand.
+  return std::make_shared<openvdb::math::Transform>(
+      openvdb::math::simplify(std::make_shared<openvdb::math::AffineMap>(m)));
+}
 
 void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
   requireWritable(voxels, path);

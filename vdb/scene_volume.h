@@ -1,5 +1,7 @@
 #pragma once
 // Where the grid lies in the world, and the grids that leave the program (formats.md 2.3).
+#include <openvdb/math/Transform.h>
+
 #include <optional>
 #include <string>
 #include <vector>
@@ -31,6 +33,10 @@ struct VolumeSettings {
 /// volume would exceed 4,096 voxels a side.
 VoxelFrame fitVolume(const std::vector<DepthView>& views, const VolumeSettings& settings,
                      const CarveSettings& carving);
+
+/// The frame as files have it, for grids of the nodes of `level` (0: voxels): row vectors, node
+/// centres at whole indices.
+openvdb::math::Transform::Ptr fileTransform(const VoxelFrame& frame, int level = 0);
 
 /// What a finished scene says about its voxels; arrays are parallel, [N].
 struct SceneVoxels {

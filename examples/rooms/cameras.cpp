@@ -5,6 +5,7 @@
 #include <cmath>
 #include <set>
 
+#include "examples/rooms/floor_plan.h"
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
 
@@ -23,17 +24,6 @@ double uniform(std::mt19937_64& random, double a, double b) {
   return a + (b - a) * (double(random() >> 11) * 0x1p-53);
 }
 
-bool isInside(const std::vector<Vector2f>& outline, const Vector2f& p) {
-  bool inside = false;
-  for (size_t i = 0, j = outline.size() - 1; i < outline.size(); j = i++) {
-    const Vector2f &a = outline[i], &b = outline[j];
-    if ((a.y() > p.y()) != (b.y() > p.y()) &&
-        p.x() < (b.x() - a.x()) * (p.y() - a.y()) / (b.y() - a.y()) + a.x())
-      inside = !inside;
-  }
-  return inside;
-}
-
 float distanceToOutline(const std::vector<Vector2f>& outline, const Vector2f& p) {
   float nearest = INFINITY;
   for (size_t i = 0, j = outline.size() - 1; i < outline.size(); j = i++) {
@@ -42,12 +32,6 @@ float distanceToOutline(const std::vector<Vector2f>& outline, const Vector2f& p)
     nearest = std::min(nearest, (outline[j] + t * d - p).norm());
   }
   return nearest;
-}
-
-float ceilingAt(const Room& room, const Vector2f& p) {
-  float z = INFINITY;
-  for (const Vector3f& c : room.ceilings) z = std::min(z, c.x() * p.x() + c.y() * p.y() + c.z());
-  return z;
 }
 
 Eigen::AlignedBox2f footprint(const Room& room) {
@@ -110,7 +94,7 @@ bool seesEnough(const RayTarget& solid, const Camera& camera) {
 
 bool isFree(const Room& room, const Vector3f& p_room, float margin_m) {
   const Vector2f p = p_room.head<2>();
-  if (p_room.z() < margin_m || p_room.z() + margin_m > ceilingAt(room, p)) return false;
+  if (p_room.z() < margin_m || p_room.z() + margin_m > ceilingAt(room.ceilings, p)) return false;
   if (!isInside(room.floor, p) || distanceToOutline(room.floor, p) < margin_m) return false;
   return std::none_of(room.solids.begin(), room.solids.end(), [&](const Eigen::AlignedBox3f& box) {
     return box.exteriorDistance(p_room) < std::max(margin_m, 1e-6f);
@@ -198,7 +182,7 @@ std::vector<Vector3f> freePoints(const Room& room, int count, uint64_t seed) {
   constexpr float kMargin = .03f;  // metres from walls (skirting, frames) and furniture
   const Eigen::AlignedBox2f area = footprint(room);
   float top = 0;
-  for (const Vector2f& p : room.floor) top = std::max(top, ceilingAt(room, p));
+  for (const Vector2f& p : room.floor) top = std::max(top, ceilingAt(room.ceilings, p));
   std::mt19937_64 random(seed);
   std::vector<Vector3f> points;
   for (int tries = 0; int(points.size()) < count; ++tries) {

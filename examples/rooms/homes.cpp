@@ -16,6 +16,7 @@
 #include <pugixml.hpp>
 #include <set>
 
+#include "examples/rooms/floor_plan.h"
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
 
@@ -322,17 +323,6 @@ class HomeReader {
 
 double cross(const Vector2d& a, const Vector2d& b) { return a.x() * b.y() - a.y() * b.x(); }
 Vector2d leftOf(const Vector2d& d) { return {-d.y(), d.x()}; }
-
-bool contains(const Outline& outline, const Vector2d& p) {
-  bool inside = false;
-  for (size_t i = 0, j = outline.size() - 1; i < outline.size(); j = i++) {
-    const Vector2d &a = outline[i], &b = outline[j];
-    if ((a.y() > p.y()) != (b.y() > p.y()) &&
-        p.x() < (b.x() - a.x()) * (p.y() - a.y()) / (b.y() - a.y()) + a.x())
-      inside = !inside;
-  }
-  return inside;
-}
 
 bool triangleContains(const Vector2d& a, const Vector2d& b, const Vector2d& c, const Vector2d& p) {
   return cross(b - a, p - a) >= 0 && cross(c - b, p - b) >= 0 && cross(a - c, p - c) >= 0;
@@ -1045,7 +1035,7 @@ struct Plan {
   bool isCovered(int level, const Vector2d& p) const {
     for (const Space& space : home.spaces)
       if (space.ceiling_visible && elevation(space.level) >= elevation(level) &&
-          contains(space.outline, p))
+          isInside(space.outline, p))
         return true;
     for (const Item& item : home.items) {
       const Vector2d axis(std::cos(item.angle), std::sin(item.angle)), from = p - item.place;
@@ -1060,12 +1050,12 @@ struct Plan {
   /// Whether a point is in a room, not in the open or on a terrace.
   bool isIndoors(int level, const Vector2d& p) const {
     return std::any_of(rooms.begin(), rooms.end(), [&](const Space* space) {
-      return elevation(space->level) == elevation(level) && contains(space->outline, p);
+      return elevation(space->level) == elevation(level) && isInside(space->outline, p);
     });
   }
 
   bool holds(const Space& space, const Item& item) const {
-    return elevation(item.level) == elevation(space.level) && contains(space.outline, item.place);
+    return elevation(item.level) == elevation(space.level) && isInside(space.outline, item.place);
   }
 
   /// Rooms: floors under a cover, walled in for the most part.
@@ -1235,7 +1225,7 @@ Vector2d middleOf(const Outline& outline) {
 bool lightsUp(const RoomLight& light, const Outline& outline) {
   const Vector2d p = light.centre.head<2>().cast<double>();
   const Vector2d inward = light.half_u.cross(light.half_v).head<2>().cast<double>();
-  return contains(outline,
+  return isInside(outline,
                   inward.isZero() ? p : Vector2d(p + (light.bound_m + .3) * inward.normalized()));
 }
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "examples/rooms/floor_plan.h"
 #include "splat/image.h"
 #include "vdb/error.h"
 
@@ -188,22 +189,9 @@ void Shaper::curtain(const Place& at, float lo, float hi, float bottom, float to
 // --- shell
 // ------------------------------------------------------------------------------------------
 
-float Shell::ceilingAt(const Vector2f& p) const {
-  float z = INFINITY;
-  for (const Vector3f& c : ceilings) z = std::min(z, c.x() * p.x() + c.y() * p.y() + c.z());
-  return z;
-}
+float Shell::ceilingAt(const Vector2f& p) const { return vdbc::ceilingAt(ceilings, p); }
 
-bool Shell::contains(const Vector2f& p) const {
-  bool inside = false;
-  for (size_t i = 0, j = outline.size() - 1; i < outline.size(); j = i++) {
-    const Vector2f &a = outline[i], &b = outline[j];
-    if ((a.y() > p.y()) != (b.y() > p.y()) &&
-        p.x() < (b.x() - a.x()) * (p.y() - a.y()) / (b.y() - a.y()) + a.x())
-      inside = !inside;
-  }
-  return inside;
-}
+bool Shell::contains(const Vector2f& p) const { return isInside(outline, p); }
 
 namespace {
 

@@ -1,6 +1,5 @@
 // Truth of a room on a grid, from its triangles, and its files.
 #include <openvdb/io/File.h>
-#include <openvdb/math/Maps.h>
 #include <openvdb/tools/MeshToVolume.h>
 #include <openvdb/tools/Prune.h>
 
@@ -8,10 +7,12 @@
 #include <array>
 #include <cmath>
 
+#include "examples/rooms/floor_plan.h"
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
 #include "vdb/file_io.h"
 #include "vdb/grid_instances.h"
+#include "vdb/scene_volume.h"
 
 namespace vdbc {
 
@@ -114,10 +115,8 @@ VoxelFrame truthFrame(const Room& room, float voxel_m) {
   frame.world_from_grid.translate(-shift.cast<double>());
   Eigen::AlignedBox3f box;
   for (const Eigen::Vector2f& p : room.floor) {
-    float top = INFINITY;
-    for (const Vector3f& c : room.ceilings) top = std::min(top, c.x() * p.x() + c.y() * p.y() + c.z());
     box.extend(Vector3f(p.x(), p.y(), 0) + shift);
-    box.extend(Vector3f(p.x(), p.y(), top) + shift);
+    box.extend(Vector3f(p.x(), p.y(), ceilingAt(room.ceilings, p)) + shift);
   }
   Coord lo, hi;
   for (int a = 0; a < 3; ++a) {
@@ -161,23 +160,10 @@ void floodEmpty(const VoxelFrame& frame, const std::vector<Coord>& seeds, Observ
   }
 }
 
-openvdb::math::Transform::Ptr nodeTransform(const VoxelFrame& frame, int level) {
-  const double edge = double(frame.voxel_m) * (1 << level);
-  const Eigen::Matrix3d scaled = frame.world_from_grid.linear() * edge;
-  const Vector3d centre = frame.toWorld(Vector3d::Constant(.5 * (1 << level)));
-  openvdb::Mat4d m = openvdb::Mat4d::identity();
-  for (int row = 0; row < 3; ++row) {
-    for (int col = 0; col < 3; ++col) m[row][col] = scaled(col, row);
-    m[3][row] = centre[row];
-  }
-  return std::make_shared<openvdb::math::Transform>(
-      openvdb::math::simplify(std::make_shared<openvdb::math::AffineMap>(m)));
-}
-
 MaskGrid::Ptr maskGrid(const char* name, const VoxelFrame& frame, int level) {
   MaskGrid::Ptr grid = MaskGrid::create();
   grid->setName(name);
-  grid->setTransform(nodeTransform(frame, level));
+  grid->setTransform(fileTransform(frame, level));
   return grid;
 }
 
@@ -201,7 +187,7 @@ FloatGrid::Ptr distanceGrid(const TriangleMesh& mesh, const VoxelFrame& frame) {
   for (const Eigen::Vector3i& t : mesh.triangles)
     triangles.emplace_back(uint32_t(t[0]), uint32_t(t[1]), uint32_t(t[2]));
   const openvdb::tools::QuadAndTriangleDataAdapter<openvdb::Vec3s, openvdb::Vec3I> data(points, triangles);
-  const auto transform = nodeTransform(frame, 0);
+  const auto transform = fileTransform(frame, 0);
   FloatGrid::Ptr grid = openvdb::tools::meshToVolume<FloatGrid>(
       data, *transform, kBandVoxels, kBandVoxels, openvdb::tools::UNSIGNED_DISTANCE_FIELD);
   grid->setName("distance");
