@@ -54,6 +54,7 @@ struct Evaluate {
 };
 struct Train {
   std::string output, work, cache, preset = "small", encoder;
+  std::vector<std::string> changes;
   int64_t steps = 0, scenes = 0;
   double rate = 0;
   bool resume = false;
@@ -262,6 +263,7 @@ TrainSettings trainSettings(const Train& t, const Common& common) {
   s.weights_path = t.output;
   s.work_folder = t.work.empty() ? t.output + ".work" : t.work;
   s.steps = t.steps, s.learning_rate = t.rate, s.seed = common.seed, s.resume = t.resume;
+  s.validate_every = std::clamp<int64_t>(t.steps / 8, 1, s.validate_every);
   return s;
 }
 
@@ -280,13 +282,30 @@ TrainListener trainListener(bool json) {
   };
 }
 
+// The preset's configuration with --set NAME=VALUE applied.
+template <typename Config>
+Config configOf(const Train& t) {
+  ordered_json j = ordered_json::parse((t.preset == "paper" ? Config::paper() : Config::small()).toJson());
+  for (const std::string& change : t.changes) {
+    const size_t equals = change.find('=');
+    const std::string name = change.substr(0, equals);
+    if (equals == std::string::npos || !j.contains(name))
+      throw UsageError(joinText("--set: ", change, ": expected NAME=VALUE with one of ", j.dump()));
+    const ordered_json value = ordered_json::parse(change.substr(equals + 1), nullptr, false);
+    if (value.type() != j[name].type() && !(value.is_number() && j[name].is_number_float()))
+      throw UsageError(joinText("--set: ", change, ": expected a value like ", j[name].dump()));
+    j[name] = value;
+  }
+  return Config::fromJson(j.dump(), "--set");
+}
+
 std::string seedRange(uint64_t first, int64_t count) {
   return joinText("rooms:", first, "-", first + uint64_t(count) - 1);
 }
 
 void cookTrainEncoder(const Train& t, const Common& common, Progress& progress) {
   constexpr int kValidationRooms = 12;
-  const EncoderConfig config = t.preset == "paper" ? EncoderConfig::paper() : EncoderConfig::small();
+  const EncoderConfig config = configOf<EncoderConfig>(t);
   TrainSettings s = trainSettings(t, common);
   s.metadata["trained_on"] = seedRange(kTrainingSeed, t.scenes);
   s.metadata["validated_on"] = seedRange(kValidationSeed, kValidationRooms);
@@ -300,7 +319,7 @@ void cookTrainEncoder(const Train& t, const Common& common, Progress& progress) 
 void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
   constexpr int kValidationRooms = 8;
   const Encoder encoder(t.encoder);
-  CompleterConfig config = t.preset == "paper" ? CompleterConfig::paper() : CompleterConfig::small();
+  CompleterConfig config = configOf<CompleterConfig>(t);
   config.latent_dim = encoder.config().latent_dim, config.latent_groups = encoder.config().latent_groups;
   TrainSettings s = trainSettings(t, common);
   s.metadata["trained_on"] = seedRange(kTrainingSeed, t.scenes);
@@ -372,6 +391,7 @@ void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rat
   verb->add_option("--work", t->work, "folder for checkpoint, log and pictures [OUTPUT.work]");
   verb->add_option("--cache", t->cache, "folder of rooms from make_rooms; missing ones are put there [render each time]");
   verb->add_option("--preset", t->preset, "small or paper")->check(CLI::IsMember({"small", "paper"}))->capture_default_str();
+  verb->add_option("--set", t->changes, "NAME=VALUE, changes a size of the preset (several allowed)")->allow_extra_args(false);
   auto* s = verb->add_option("--steps", t->steps, joinText("training steps [", steps, "]"))->check(CLI::Range(int64_t(1), int64_t(1) << 40));
   auto* n = verb->add_option("--rooms", t->scenes, joinText("furnished rooms to train on [", rooms, "]"))
                 ->check(CLI::Range(int64_t(1), int64_t(kReservedSeeds)));
