@@ -16,7 +16,7 @@ EncoderConfig EncoderConfig::paper() {
   c.voxel_width = 256, c.width = 512, c.heads = 16;
   c.blocks = 6, c.decoder_blocks = 6, c.window = 1024;
   c.kl_weight = .1f;
-  c.gaussians_per_axis = 6;
+  c.gaussians_per_voxel = 216;
   return c;
 }
 
@@ -30,7 +30,7 @@ void visitFields(Config& c, Visit&& visit) {
   visit("blocks", c.blocks), visit("decoder_blocks", c.decoder_blocks), visit("window", c.window);
   visit("latent_dim", c.latent_dim), visit("latent_groups", c.latent_groups);
   visit("kl_weight", c.kl_weight), visit("occupancy_weight", c.occupancy_weight);
-  visit("gaussians_per_axis", c.gaussians_per_axis), visit("guide_alpha", c.guide_alpha);
+  visit("gaussians_per_voxel", c.gaussians_per_voxel), visit("guide_alpha", c.guide_alpha);
   visit("guide_log_counts", c.guide_log_counts), visit("false_positives", c.false_positives);
 }
 }  // namespace
@@ -58,9 +58,9 @@ EncoderConfig EncoderConfig::fromJson(const std::string& text, const std::string
   within("width", c.width, 1, 4096), within("heads", c.heads, 1, 64);
   within("blocks", c.blocks, 1, 64), within("decoder_blocks", c.decoder_blocks, 0, 64);
   within("window", c.window, 2, 1 << 16), within("latent_dim", c.latent_dim, 1, 1024);
-  within("latent_groups", c.latent_groups, 1, c.latent_dim);
-  within("gaussians_per_axis", c.gaussians_per_axis, 1, 8);
-  require(c.width % (2 * c.heads) == 0 && c.latent_dim % c.latent_groups == 0 && c.voxel_m > 0,
+  within("latent_groups", c.latent_groups, 0, c.latent_dim);
+  within("gaussians_per_voxel", c.gaussians_per_voxel, 1, 512);
+  require(c.width % (2 * c.heads) == 0 && (c.latent_groups == 0 || c.latent_dim % c.latent_groups == 0) && c.voxel_m > 0,
           "EncoderConfig: ", where, ": width, heads, groups or voxel size do not fit each other");
   return c;
 }
@@ -122,26 +122,23 @@ struct Children {
   std::vector<int32_t> node;  // row of the latent
 };
 
-Gaussians toWorld(const GaussianTensors& t, const VoxelFrame& frame) {
-  Gaussians g;
-  const int64_t n = t.mean.size(0);
-  g.resize(n, 0);
+// Writes Gaussians of the grid frame over those of `g` from `first` on, in the world's.
+void copyToWorld(const GaussianTensors& t, const VoxelFrame& frame, size_t first, Gaussians* g) {
   auto copy = [](const Tensor& from, void* to) {
     const Tensor c = from.contiguous();
     std::memcpy(to, c.data_ptr(), c.nbytes());
   };
-  copy(t.mean, g.mean.data()), copy(t.log_scale, g.log_scale.data());
-  copy(t.rotation, g.rotation.data()), copy(t.opacity_logit, g.opacity_logit.data());
-  copy(t.sh, g.sh.data());
+  copy(t.mean, &g->mean[first]), copy(t.log_scale, &g->log_scale[first]);
+  copy(t.rotation, &g->rotation[first]), copy(t.opacity_logit, &g->opacity_logit[first]);
+  copy(t.sh, &g->sh[3 * first]);
   const Eigen::Isometry3f world_from_grid = frame.world_from_grid.cast<float>();
   const Eigen::Quaternionf turn(world_from_grid.linear());
-  for (int64_t i = 0; i < n; ++i) {
-    g.mean[size_t(i)] = world_from_grid * g.mean[size_t(i)];
-    const Eigen::Vector4f q = g.rotation[size_t(i)];
+  for (size_t i = first; i < first + size_t(t.mean.size(0)); ++i) {
+    g->mean[i] = world_from_grid * g->mean[i];
+    const Eigen::Vector4f q = g->rotation[i];
     const Eigen::Quaternionf r = (turn * Eigen::Quaternionf(q[0], q[1], q[2], q[3])).normalized();
-    g.rotation[size_t(i)] = {r.w(), r.x(), r.y(), r.z()};
+    g->rotation[i] = {r.w(), r.x(), r.y(), r.z()};
   }
-  return g;
 }
 
 }  // namespace
@@ -159,7 +156,7 @@ DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen
     return out;
   }
   std::vector<Coord> coords = latents.ijk;
-  Tensor tokens = impl_->net->decodeTokens(
+  DecoderTokens tokens = impl_->net->decodeTokens(
       torch::tensor(latents.z).view({latents.size(), latents.dim}), coordTensor(coords), zOrder(coords));
   report(progress, -1);
 
@@ -206,7 +203,17 @@ DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen
     probability = std::move(kept.probability);
     report(progress, -1);
   }
-  out.gaussians = toWorld(impl_->net->gaussians(tokens, coordTensor(coords), latents.frame.voxel_m), latents.frame);
+  // Some voxels at a time: with hundreds of Gaussians a voxel the last layer's output is many times the result.
+  constexpr int64_t kChunk = 4096;
+  const int64_t voxels = int64_t(coords.size()), m = c.gaussians_per_voxel;
+  const Tensor all_coords = coordTensor(coords);
+  out.gaussians.resize(voxels * m, 0);
+  for (int64_t begin = 0; begin < voxels; begin += kChunk) {
+    const int64_t end = std::min(voxels, begin + kChunk);
+    copyToWorld(impl_->net->gaussians(tokens.rows(begin, end), all_coords.slice(0, begin, end), latents.frame.voxel_m),
+                latents.frame, size_t(begin * m), &out.gaussians);
+    report(progress, int(100 * end / voxels));
+  }
   out.voxels = std::move(coords), out.node = std::move(node);
   out.child_probability = std::move(probability);
   return out;

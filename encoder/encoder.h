@@ -24,10 +24,10 @@ struct EncoderConfig {
   int decoder_blocks = 2;
   int window = 256;            // tokens per self-attention window
   int latent_dim = 32;
-  int latent_groups = 8;       // of the GroupNorm after sampling, per token
+  int latent_groups = 8;       // of the GroupNorm after sampling, per token; 0: none
   float kl_weight = 1e-4f;     // beta; image error and KL are both means (spec E12)
   float occupancy_weight = 0.02f;  // of BCE-up
-  int gaussians_per_axis = 2;  // M = its cube
+  int gaussians_per_voxel = 8;  // M
   float guide_alpha = -1;      // fixed share of learned attention, or -1: learned, starts at .5
   bool guide_log_counts = false;  // softmax(log(1 + count)) instead of softmax(count)
   float false_positives = 0.25f;  // injected when splitting, as a share of the truth

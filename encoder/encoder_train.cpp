@@ -13,7 +13,7 @@
 namespace vdbc {
 namespace {
 
-constexpr int kStepsPerScene = 4;  // with other views each time
+constexpr int64_t kStepsPerScene = 4;  // with other views each time
 
 struct Losses {
   Tensor image, kl, occupancy;
@@ -80,7 +80,7 @@ GaussianTensors decodeForTraining(EncoderNet& net, const Tensor& z, const Encode
                                   const Observation& o, torch::Generator* random, Tensor* occupancy) {
   const EncoderConfig& c = net.config;
   std::vector<Coord> coords = o.tokens.coords(c.levels);
-  Tensor tokens = net.decodeTokens(z, in.coords, in.order);
+  DecoderTokens tokens = net.decodeTokens(z, in.coords, in.order);
   for (int split = 0; split < c.levels; ++split) {
     const int level = c.levels - split;
     const auto [truth, known] = childTruth(coords, level, o);
@@ -205,37 +205,42 @@ void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_
   std::vector<std::vector<View>> held_out;
   for (int i = 0; i < validation_count; ++i) held_out.push_back(viewsOf(validation, uint64_t(i), 4));
 
-  auto sceneOfStep = [&](int64_t step) { return uint64_t(step / kStepsPerScene % scene_count); };
-  std::vector<View> views = viewsOf(scenes, sceneOfStep(trainer.step()), 3);
-  std::future<std::vector<View>> next;
+  // The scenes of a round of kStepsPerScene steps, one for each of this process's samples in a step.
+  auto scenesOfRound = [&, first = trainer.firstSample() - trainer.step() * settings.batch](int64_t round) {
+    std::vector<std::vector<View>> all;
+    for (int64_t k = first; k < first + trainer.samples(); ++k)
+      all.push_back(viewsOf(scenes, uint64_t((round * settings.batch + k) % scene_count), 3));
+    return all;
+  };
+  auto current = scenesOfRound(trainer.step() / kStepsPerScene);
+  std::future<std::vector<std::vector<View>>> next;
   progress.start("train encoder");
   while (!trainer.done()) {
-    const int64_t step = trainer.step();
-    if (!next.valid())
-      next = std::async(std::launch::async, viewsOf, scenes, sceneOfStep(step + kStepsPerScene), 3);
-    // A generator per step: a resumed run draws what an uninterrupted one would have drawn.
-    torch::Generator random = at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(step));
-    const std::vector<size_t> order = shuffledIndices(views.size(), random);
-    const size_t n = std::min(views.size() - 2, size_t(1) << randomInt(4, random));  // 1, 2, 4, 8
-    std::vector<View> condition, targets;
-    for (size_t i = 0; i < n; ++i) condition.push_back(views[order[i]]);
-    for (size_t i = 0; i < std::min<size_t>(n, 2); ++i) targets.push_back(views[order[i]]);
-    for (size_t i = n; i < std::min(views.size(), n + 2); ++i) targets.push_back(views[order[i]]);
-    const Losses l = sceneLosses(*net, condition, targets, random);
-    const Tensor total = l.total(config);
-    total.backward();
-    trainer.update({{"loss", total.item<double>()}, {"image", l.image.item<double>()},
-                    {"kl", l.kl.item<double>()}, {"split", l.occupancy.item<double>()}});
-    if (trainer.step() % kStepsPerScene == 0) views = next.get();
+    if (!next.valid()) next = std::async(std::launch::async, scenesOfRound, trainer.step() / kStepsPerScene + 1);
+    for (int64_t k = 0; k < trainer.samples(); ++k) {
+      const std::vector<View>& views = current[size_t(k)];
+      // A generator per sample: a resumed run draws what an uninterrupted one would have drawn.
+      torch::Generator random =
+          at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(trainer.firstSample() + k));
+      const std::vector<size_t> order = shuffledIndices(views.size(), random);
+      const size_t n = std::min(views.size() - 2, size_t(1) << randomInt(4, random));  // 1, 2, 4, 8
+      std::vector<View> condition, targets;
+      for (size_t i = 0; i < n; ++i) condition.push_back(views[order[i]]);
+      for (size_t i = 0; i < std::min<size_t>(n, 2); ++i) targets.push_back(views[order[i]]);
+      for (size_t i = n; i < std::min(views.size(), n + 2); ++i) targets.push_back(views[order[i]]);
+      const Losses l = sceneLosses(*net, condition, targets, random);
+      const Tensor total = l.total(config);
+      trainer.addSample(total, {{"loss", total.item<double>()}, {"image", l.image.item<double>()},
+                                {"kl", l.kl.item<double>()}, {"split", l.occupancy.item<double>()}});
+    }
+    trainer.update();
+    if (trainer.step() % kStepsPerScene == 0) current = next.get();
     if (trainer.validationDue()) {
       const Validation v = validate(*average, held_out, settings.work_folder + "/validation.png");
       trainer.log({{"input_psnr", v.input_psnr}, {"novel_psnr", v.novel_psnr}});
     }
     trainer.saveIfDue();
-    if (progress.wasInterrupted(int(100 * trainer.step() / settings.steps))) {
-      trainer.saveCheckpoint();
-      throw Cancelled();
-    }
+    trainer.stopIfInterrupted(progress);
   }
   progress.end();
 }

@@ -148,8 +148,7 @@ void BidirectionalBlock::forward(Tensor* x3, Tensor* x2, const EncoderInput& in,
 }
 
 EncoderNet::EncoderNet(const EncoderConfig& c) : config(c) {
-  const int64_t d = c.width, dv = c.voxel_width, m = int64_t(c.gaussians_per_axis) *
-                                                     c.gaussians_per_axis * c.gaussians_per_axis;
+  const int64_t d = c.width, dv = c.voxel_width, m = c.gaussians_per_voxel;
   auto norm = [&](int64_t width) { return nn::LayerNorm(nn::LayerNormOptions({width})); };
   voxel_in = register_module("voxel_in", std::make_shared<Mlp>(kVoxelFeatures, 2 * dv, c.levels ? dv : d));
   for (int l = 1; l <= c.levels; ++l)
@@ -161,12 +160,10 @@ EncoderNet::EncoderNet(const EncoderConfig& c) : config(c) {
   for (int b = 0; b < c.blocks; ++b)
     blocks.push_back(register_module("block" + std::to_string(b),
                                      std::make_shared<BidirectionalBlock>(c, b + 1 < c.blocks)));
-  feature_shortcut = register_module("feature_shortcut", nn::Linear(kVoxelFeatures, c.latent_dim));
-  colour_shortcut = register_module("colour_shortcut", nn::Linear(c.latent_dim, 3));
+  feature_shortcut = register_module("feature_shortcut", nn::Linear(kVoxelFeatures + 24, c.latent_dim));
+  colour_shortcut = register_module("colour_shortcut", nn::Linear(c.latent_dim, 24));
   posterior_norm = register_module("posterior_norm", norm(d));
   posterior = register_module("posterior", nn::Linear(d, 2 * c.latent_dim));
-  latent_norm = register_module(
-      "latent_norm", nn::GroupNorm(nn::GroupNormOptions(c.latent_groups, c.latent_dim).affine(false)));
   latent_in = register_module("latent_in", nn::Linear(c.latent_dim, d));
   for (int b = 0; b < c.decoder_blocks; ++b)
     decoder_blocks.push_back(register_module("decoder_block" + std::to_string(b),
@@ -214,6 +211,7 @@ Tensor scaledFeatures(const Tensor& f) {
 
 EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
   Tensor pooled = scaledFeatures(in.voxel_features);
+  Tensor octants = pooled.slice(1, 0, 32).view({-1, 8, 4}).slice(2, 0, 3);  // colours, [N, 8, 3]
   Tensor x3 = voxel_in->forward(pooled);
   for (size_t l = 0; l < aggregate.size(); ++l) {
     const Tensor& children = in.children[l];
@@ -222,6 +220,7 @@ EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
           .index_select(0, children.flatten()).view({children.size(0), 8, rows.size(1)});
     };
     const Tensor present = (children < x3.size(0)).sum(1, true).to(torch::kFloat32);
+    octants = gather(pooled.slice(1, 32, 35));
     pooled = gather(pooled).sum(1) / present;
     x3 = aggregate[l]->forward(gather(x3).flatten(1));
   }
@@ -233,48 +232,60 @@ EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
   const Rotary pos = rotary(in.coords, config.width / config.heads);
   for (size_t b = 0; b < blocks.size(); ++b) blocks[b]->forward(&x3, &x2, in, pos, int(b));
   const auto halves = posterior->forward(posterior_norm->forward(x3)).chunk(2, 1);
-  return {halves[0] + feature_shortcut->forward(pooled), halves[1].clamp(-12, 4)};
+  const Tensor shallow = feature_shortcut->forward(torch::cat({pooled, octants.flatten(1)}, 1));
+  return {halves[0] + shallow, halves[1].clamp(-12, 4)};
 }
 
-Tensor EncoderNet::normalise(const Tensor& z) { return latent_norm->forward(z); }
+Tensor EncoderNet::normalise(const Tensor& z) {
+  return config.latent_groups ? torch::group_norm(z, config.latent_groups) : z;
+}
 
-Tensor EncoderNet::decodeTokens(const Tensor& z, const Tensor& coords, const Tensor& order) {
+DecoderTokens EncoderNet::decodeTokens(const Tensor& z, const Tensor& coords, const Tensor& order) {
   Tensor x = latent_in->forward(z);
   const Rotary pos = rotary(coords, config.width / config.heads);
   for (size_t b = 0; b < decoder_blocks.size(); ++b)
     x = decoder_blocks[b]->forward(x, &pos, order, config.window, b % 2 == 1);
-  return torch::cat({decoder_norm->forward(x), colour_shortcut->forward(z)}, 1);
+  return {decoder_norm->forward(x), colour_shortcut->forward(z).view({-1, 8, 3})};
 }
 
-Tensor EncoderNet::childLogits(const Tensor& tokens, int split) {
-  return child_logits[size_t(split)]->forward(tokens.slice(1, 0, -3));
+Tensor EncoderNet::childLogits(const DecoderTokens& tokens, int split) {
+  return child_logits[size_t(split)]->forward(tokens.features);
 }
 
-Tensor EncoderNet::splitTokens(const Tensor& tokens, const Split& s, int split) {
-  const Tensor all = child_tokens[size_t(split)]->forward(tokens.slice(1, 0, -3)).view({tokens.size(0) * 8, -1});
-  return torch::cat({all.index_select(0, s.parent * 8 + s.slot),
-                     tokens.slice(1, -3).index_select(0, s.parent)}, 1);
+DecoderTokens EncoderNet::splitTokens(const DecoderTokens& tokens, const Split& s, int split) {
+  const Tensor rows = s.parent * 8 + s.slot;
+  const Tensor features = child_tokens[size_t(split)]->forward(tokens.features).view({tokens.features.size(0) * 8, -1});
+  const Tensor colours = tokens.colours.reshape({-1, 1, 3}).index_select(0, rows);
+  return {features.index_select(0, rows), colours.expand({-1, 8, 3})};
 }
 
-GaussianTensors EncoderNet::gaussians(const Tensor& voxel_tokens, const Tensor& coords, float h) {
-  const int64_t n = coords.size(0), per_axis = config.gaussians_per_axis;
-  const int64_t m = per_axis * per_axis * per_axis;
-  Tensor x = voxel_tokens.slice(1, 0, -3);
+Tensor subLattice(int64_t m) {
+  const int64_t side = int64_t(std::ceil(std::cbrt(double(m)) - 1e-9)), cells = side * side * side;
+  const Tensor cell = torch::arange(m) * cells / m;
+  const auto at = [&](int64_t stride) {
+    return (torch::floor_divide(cell.to(torch::kInt64), stride).remainder(side).to(torch::kFloat32) + .5f) / float(side);
+  };
+  return torch::stack({at(side * side), at(side), at(1)}, 1);
+}
+
+GaussianTensors EncoderNet::gaussians(const DecoderTokens& voxels, const Tensor& coords, float h) {
+  const int64_t n = coords.size(0), m = config.gaussians_per_voxel;
+  Tensor x = voxels.features;
   x = gaussian_out->forward(gaussian_norm->forward(x + gaussian_mlp->forward(x))).view({n, m, 14});
-  const Tensor colour = x.slice(2, 11, 14) + voxel_tokens.slice(1, -3).unsqueeze(1);
-  // Sub-lattice of the voxel, x slowest; offsets reach .75 voxel (spec E11).
-  const Tensor axis = (torch::arange(per_axis, torch::kFloat32) + .5f) / float(per_axis);
-  const auto grid = torch::meshgrid({axis, axis, axis}, "ij");
-  const Tensor lattice = torch::stack({grid[0], grid[1], grid[2]}, -1).view({1, m, 3});
+  const Tensor lattice = subLattice(m), high = (lattice > .5f).to(torch::kInt64);
+  const Tensor octant = high.select(1, 0) * 4 + high.select(1, 1) * 2 + high.select(1, 2);
+  const Tensor colour = x.slice(2, 11, 14) + voxels.colours.index_select(1, octant);
   const Tensor corner = coords.to(torch::kFloat32).unsqueeze(1);
-  // Biases at the start: sigma of half a sub-cell, opacity .73, unit rotation, grey.
-  const float sigma0 = .5f / float(per_axis), raw0 = std::log(std::expm1(sigma0));
+  // Biases at the start: sigma of half a sub-cell, opacity .73, unit rotation, grey. Offsets reach .75 voxel.
+  const float sigma0 = .5f / float(std::cbrt(double(m))), raw0 = std::log(std::expm1(sigma0));
   GaussianTensors g;
-  g.mean = ((corner + lattice + .75f * torch::tanh(x.slice(2, 0, 3))) * h).view({n * m, 3});
+  g.mean = ((corner + lattice.unsqueeze(0) + .75f * torch::tanh(x.slice(2, 0, 3))) * h).view({n * m, 3});
   g.log_scale = torch::log(torch::softplus(x.slice(2, 3, 6) + raw0).clamp(.02, 1.5) * h).view({n * m, 3});
   g.rotation = (x.slice(2, 6, 10) + torch::tensor({1.f, 0.f, 0.f, 0.f})).view({n * m, 4});
   g.opacity_logit = (x.slice(2, 10, 11) + 1).view({n * m});
-  g.sh = (srgbFromOpponent(colour) / kSh0).view({n * m, 1, 3});
+  // Rasterisers cut colours off at 0, where no gradient passes: a channel that fell below stayed dark for good.
+  const Tensor srgb = srgbFromOpponent(colour) + .5f;
+  g.sh = ((srgb + (srgb.clamp_min(1e-3) - srgb).detach() - .5f) / kSh0).view({n * m, 1, 3});
   return g;
 }
 

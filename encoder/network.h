@@ -53,6 +53,20 @@ struct Split {
   Tensor slot;    // [V] int64, 0-7
 };
 
+/// What the decoder knows of N tokens: features of its transformer and, around them, the colours that the
+/// Gaussians in each of a token's 8 octants start from (opponent colours).
+struct DecoderTokens {
+  Tensor features;  // [N, C]
+  Tensor colours;   // [N, 8, 3]
+  DecoderTokens rows(int64_t begin, int64_t end) const {
+    return {features.slice(0, begin, end), colours.slice(0, begin, end)};
+  }
+};
+
+/// Places of M Gaussians in a unit voxel, [M, 3]: centres of the smallest cubic lattice with at least M
+/// cells, every cell where M is a cube and evenly spread ones elsewhere; x slowest. Spec E11.
+Tensor subLattice(int64_t m);
+
 /// Raw outputs for V voxels.
 struct GaussianTensors {
   Tensor mean, log_scale, rotation, opacity_logit, sh;  // [V * M, ...] grid frame, metres
@@ -65,30 +79,27 @@ struct EncoderNet : torch::nn::Module {
     Tensor mean, log_variance;  // [N, latent_dim]
   };
   Posterior encode(const EncoderInput& in);
-  /// GroupNorm over each token's channel groups (E10); the completer's outputs pass through it too.
+  /// GroupNorm over each token's channel groups (E10), or nothing with 0 groups.
   Tensor normalise(const Tensor& z);
 
-  /// Tokens of the decoder's transformer and, as the last 3 channels, the colour that all of a token's
-  /// Gaussians start from (opponent colours): [N, C + 3]. So are the tokens of childLogits, splitTokens and
-  /// gaussians.
-  Tensor decodeTokens(const Tensor& z, const Tensor& coords, const Tensor& order);
-  /// BCE-up logits of the 8 children, [N, 8], at the first (coarsest) split.
-  Tensor childLogits(const Tensor& tokens, int split);
-  /// Token features of the children, [V, C'].
-  Tensor splitTokens(const Tensor& tokens, const Split& split, int level);
+  /// Tokens of latents [N, latent_dim].
+  DecoderTokens decodeTokens(const Tensor& z, const Tensor& coords, const Tensor& order);
+  /// BCE-up logits of the 8 children, [N, 8]; split 0 is the coarsest.
+  Tensor childLogits(const DecoderTokens& tokens, int split);
+  /// Tokens of the children.
+  DecoderTokens splitTokens(const DecoderTokens& tokens, const Split& split, int level);
   /// Gaussians of voxels (coords [V, 3]) of edge voxel_m.
-  GaussianTensors gaussians(const Tensor& voxel_tokens, const Tensor& coords, float voxel_m);
+  GaussianTensors gaussians(const DecoderTokens& voxels, const Tensor& coords, float voxel_m);
 
   const EncoderConfig config;
   std::shared_ptr<Mlp> voxel_in, gaussian_mlp;
   std::vector<std::shared_ptr<Mlp>> aggregate;
   torch::nn::Linear position_in{nullptr}, patch_in{nullptr}, geometry_in{nullptr}, posterior{nullptr},
       latent_in{nullptr}, gaussian_out{nullptr};
-  // Shallow ways around the transformers, for the mean colour of a token: learned in minutes, where the
-  // deep way stayed grey for an hour.
+  // Shallow ways around the transformers, for the mean colours of a token's octants: learned in minutes,
+  // where the deep way stayed grey for an hour.
   torch::nn::Linear feature_shortcut{nullptr}, colour_shortcut{nullptr};
   torch::nn::LayerNorm posterior_norm{nullptr}, decoder_norm{nullptr}, gaussian_norm{nullptr};
-  torch::nn::GroupNorm latent_norm{nullptr};
   std::vector<std::shared_ptr<BidirectionalBlock>> blocks;
   std::vector<std::shared_ptr<SelfBlock>> decoder_blocks;
   std::vector<torch::nn::Linear> child_logits, child_tokens;

@@ -14,10 +14,19 @@ namespace vdbc {
 /// not the caller's. Training knows nothing else about where scenes come from.
 using SceneSource = std::function<std::vector<View>(uint64_t index)>;
 
+/// The processes that train together; each works on its share of every step's samples.
+struct TrainProcesses {
+  int rank = 0, size = 1;
+  std::string address = "127.0.0.1";  // where the process of rank 0 listens
+  uint16_t port = 29500;
+};
+
 struct TrainSettings {
   std::string weights_path;     // result: averaged weights (safetensors)
   std::string work_folder;      // checkpoint, log.csv, validation pictures
   int64_t steps = 4000;
+  int64_t batch = 1;            // samples a step, their gradients averaged; a multiple of the processes
+  TrainProcesses processes;
   double learning_rate = 8e-4;  // peak; linear warm-up, then cosine to 2 %
   int64_t warmup = 150;
   double average_decay = .998;  // of the exponential moving average that is shipped

@@ -16,8 +16,11 @@ Trainer::Trainer(std::shared_ptr<torch::nn::Module> net, std::shared_ptr<torch::
                  TrainListener listener)
     : net_(std::move(net)), average_(std::move(average)), config_key_(std::move(config_key)),
       config_(std::move(config)), settings_(std::move(settings)), listener_(std::move(listener)),
+      processes_(settings_.processes),
       optimiser_(net_->parameters(), torch::optim::AdamWOptions(settings_.learning_rate)
                                          .betas({.9, .98}).weight_decay(.01)) {
+  require(settings_.batch >= 1 && settings_.batch % processes_.size() == 0, "train: expected a batch that ",
+          processes_.size(), " processes can share evenly, found ", settings_.batch);
   std::error_code error;
   fs::create_directories(settings_.work_folder, error);
   require(!error, "train: ", settings_.work_folder, ": cannot create the folder: ", error.message());
@@ -28,11 +31,42 @@ Trainer::Trainer(std::shared_ptr<torch::nn::Module> net, std::shared_ptr<torch::
   } else {
     const auto from = net_->parameters(), to = average_->parameters();
     for (size_t i = 0; i < to.size(); ++i) to[i].copy_(from[i]);
-    fs::remove(settings_.work_folder + "/log.csv", error);
+    if (first()) fs::remove(settings_.work_folder + "/log.csv", error);
   }
 }
 
-void Trainer::update(const std::map<std::string, double>& values) {
+void Trainer::addSample(const Tensor& loss, const std::map<std::string, double>& values) {
+  if (loss.requires_grad()) (loss / double(settings_.batch)).backward();
+  for (const auto& [name, value] : values) values_[name] += value / double(settings_.batch);
+}
+
+// Gradients and logged values of all processes, in one message.
+void Trainer::sumOverProcesses() {
+  if (processes_.size() == 1) return;
+  const auto parameters = net_->parameters();
+  int64_t count = int64_t(values_.size());
+  for (const Tensor& p : parameters) count += p.numel();
+  Tensor all = torch::zeros({count});
+  int64_t at = 0;
+  for (const Tensor& p : parameters) {
+    if (p.grad().defined()) all.slice(0, at, at + p.numel()).copy_(p.grad().flatten());
+    at += p.numel();
+  }
+  for (const auto& entry : values_) all[at++] = entry.second;
+  processes_.sum(&all);
+  at = 0;
+  for (const Tensor& p : parameters) {
+    if (p.requires_grad()) {
+      if (!p.grad().defined()) p.mutable_grad() = torch::zeros_like(p);
+      p.mutable_grad().copy_(all.slice(0, at, at + p.numel()).view_as(p));
+    }
+    at += p.numel();
+  }
+  for (auto& entry : values_) entry.second = all[at++].item<double>();
+}
+
+void Trainer::update() {
+  sumOverProcesses();
   const double rate = cosineRate(settings_.learning_rate, step_, settings_.steps, settings_.warmup, .02);
   static_cast<torch::optim::AdamWOptions&>(optimiser_.param_groups()[0].options()).lr(rate);
   const double norm = torch::nn::utils::clip_grad_norm_(net_->parameters(), settings_.clip_norm);
@@ -49,8 +83,9 @@ void Trainer::update(const std::map<std::string, double>& values) {
     running_[name].first += value;
     ++running_[name].second;
   };
-  for (const auto& [name, value] : values)
+  for (const auto& [name, value] : values_)
     if (std::isfinite(value)) add(name, value);
+  values_.clear();
   add("skipped", std::isfinite(norm) ? 0 : 1);
 }
 
@@ -73,9 +108,18 @@ void Trainer::log(std::map<std::string, double> values) {
 }
 
 void Trainer::saveIfDue() {
-  if (step_ % settings_.checkpoint_every != 0 && !done()) return;
+  if (!first() || (step_ % settings_.checkpoint_every != 0 && !done())) return;
   saveCheckpoint();
   saveWeights();
+}
+
+void Trainer::stopIfInterrupted(Progress& progress) {
+  Tensor asked = torch::zeros({1});
+  asked[0] = progress.wasInterrupted(int(100 * step_ / settings_.steps)) ? 1.f : 0.f;
+  processes_.sum(&asked);
+  if (asked.item<float>() == 0) return;
+  if (first()) saveCheckpoint();
+  throw Cancelled();
 }
 
 void Trainer::saveWeights() const {

@@ -55,7 +55,7 @@ struct Evaluate {
 struct Train {
   std::string output, work, cache, preset = "small", encoder;
   std::vector<std::string> changes;
-  int64_t steps = 0, scenes = 0;
+  int64_t steps = 0, scenes = 0, batch = 1;
   double rate = 0;
   bool resume = false;
 };
@@ -255,6 +255,24 @@ void cookEvaluate(const Evaluate& o, const Complete& options, const Common& comm
   for (const MethodResult& r : meanResults(all)) show(r);
 }
 
+// RANK of WORLD_SIZE processes that meet at MASTER_ADDR:MASTER_PORT, the variables that torchrun sets.
+TrainProcesses processes() {
+  TrainProcesses p;
+  auto number = [](const char* name, int high, auto* value) {
+    const char* text = std::getenv(name);
+    if (!text) return;
+    int used = 0, found = 0;
+    if (std::sscanf(text, "%d%n", &found, &used) != 1 || text[used] != '\0' || found < 0 || found > high)
+      throw UsageError(joinText(name, ": expected a number from 0 to ", high, ", found ", text));
+    *value = std::decay_t<decltype(*value)>(found);
+  };
+  number("WORLD_SIZE", 4096, &p.size), number("RANK", 4095, &p.rank), number("MASTER_PORT", 65535, &p.port);
+  if (const char* address = std::getenv("MASTER_ADDR")) p.address = address;
+  if (p.rank >= std::max(1, p.size)) throw UsageError(joinText("RANK: expected less than WORLD_SIZE ", p.size, ", found ", p.rank));
+  p.size = std::max(1, p.size);
+  return p;
+}
+
 TrainSettings trainSettings(const Train& t, const Common& common) {
   if (fs::path(t.output).extension() != ".safetensors")
     throw UsageError(joinText("--output: ", t.output, ": expected a name that ends in .safetensors"));
@@ -262,6 +280,9 @@ TrainSettings trainSettings(const Train& t, const Common& common) {
   TrainSettings s;
   s.weights_path = t.output;
   s.work_folder = t.work.empty() ? t.output + ".work" : t.work;
+  s.batch = t.batch, s.processes = processes();
+  if (s.batch % s.processes.size != 0)
+    throw UsageError(joinText("--batch: expected a multiple of WORLD_SIZE ", s.processes.size, ", found ", s.batch));
   s.steps = t.steps, s.learning_rate = t.rate, s.seed = common.seed, s.resume = t.resume;
   s.validate_every = std::clamp<int64_t>(t.steps / 8, 1, s.validate_every);
   return s;
@@ -392,6 +413,7 @@ void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rat
   verb->add_option("--cache", t->cache, "folder of rooms from make_rooms; missing ones are put there [render each time]");
   verb->add_option("--preset", t->preset, "small or paper")->check(CLI::IsMember({"small", "paper"}))->capture_default_str();
   verb->add_option("--set", t->changes, "NAME=VALUE, changes a size of the preset (several allowed)")->allow_extra_args(false);
+  verb->add_option("--batch", t->batch, "samples a step")->check(CLI::Range(int64_t(1), int64_t(1) << 20))->capture_default_str();
   auto* s = verb->add_option("--steps", t->steps, joinText("training steps [", steps, "]"))->check(CLI::Range(int64_t(1), int64_t(1) << 40));
   auto* n = verb->add_option("--rooms", t->scenes, joinText("furnished rooms to train on [", rooms, "]"))
                 ->check(CLI::Range(int64_t(1), int64_t(kReservedSeeds)));

@@ -61,7 +61,7 @@ CompleterConfig CompleterConfig::fromJson(const std::string& text, const std::st
     require(value >= low && value <= high, "CompleterConfig: ", where, ": expected ", name, " in [",
             low, ", ", high, "], found ", value);
   };
-  within("latent_dim", c.latent_dim, 1, 1024), within("latent_groups", c.latent_groups, 1, c.latent_dim), within("width", c.width, 1, 4096);
+  within("latent_dim", c.latent_dim, 1, 1024), within("latent_groups", c.latent_groups, 0, c.latent_dim), within("width", c.width, 1, 4096);
   within("heads", c.heads, 1, 64), within("layers", c.layers, 1, 64);
   within("coarse_width", c.coarse_width, 1, 4096), within("coarse_heads", c.coarse_heads, 1, 64);
   within("coarse_layers", c.coarse_layers, 1, 64);
@@ -71,7 +71,7 @@ CompleterConfig CompleterConfig::fromJson(const std::string& text, const std::st
   within("empty_tokens", c.empty_tokens, 0, 1 << 20), within("chunk_tokens", c.chunk_tokens, 1, 1 << 20);
   within("coarse_empty_tokens", c.coarse_empty_tokens, 1, 1 << 20);
   within("coarse_chunk_tokens", c.coarse_chunk_tokens, 1, 1 << 20);
-  require(c.latent_dim % c.latent_groups == 0 && c.width % (2 * c.heads) == 0 && c.coarse_width % (2 * c.coarse_heads) == 0,
+  require((c.latent_groups == 0 || c.latent_dim % c.latent_groups == 0) && c.width % (2 * c.heads) == 0 && c.coarse_width % (2 * c.coarse_heads) == 0,
           "CompleterConfig: ", where, ": widths are not multiples of twice their heads, or the latents of their groups");
   return c;
 }

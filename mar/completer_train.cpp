@@ -336,33 +336,36 @@ void trainCompleter(const CompleterConfig& config, const SampleSource& samples, 
     held_out.push_back(validation(uint64_t(i)));
     spaces.push_back(nodeSpace(held_out.back()));
   }
-  std::future<CompletionSample> next;
+  // A fresh order of all samples every epoch, known from the sample's number alone.
+  auto load = [&](int64_t first) {
+    std::vector<CompletionSample> all;
+    for (int64_t at = first; at < first + trainer.samples(); ++at) {
+      torch::Generator epoch = at::detail::createCPUGenerator(settings.seed + 17 + uint64_t(at / sample_count));
+      all.push_back(samples(uint64_t(torch::randperm(sample_count, epoch)[at % sample_count].item<int64_t>())));
+    }
+    return all;
+  };
+  std::future<std::vector<CompletionSample>> next;
   progress.start("train completer");
   while (!trainer.done()) {
-    const int64_t step = trainer.step();
-    torch::Generator random = at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(step));
-    // A fresh order of all samples every epoch, known from the step alone.
-    auto sampleOfStep = [&](int64_t at) {
-      torch::Generator epoch = at::detail::createCPUGenerator(settings.seed + 17 + uint64_t(at / sample_count));
-      return uint64_t(torch::randperm(sample_count, epoch)[at % sample_count].item<int64_t>());
-    };
-    const CompletionSample sample = next.valid() ? next.get() : samples(sampleOfStep(step));
-    next = std::async(std::launch::async, samples, sampleOfStep(step + 1));
-    const Losses l = sampleLosses(*net, sample, random);
-    const Tensor total = l.total();
-    if (total.requires_grad()) total.backward();
-    trainer.update({{"loss", total.item<double>()}, {"coarse", l.coarse.item<double>()},
-                    {"fine", l.fine.item<double>()}, {"linear", l.linear.item<double>()},
-                    {"diffusion", l.diffusion.item<double>()}, {"refinement", l.refinement.item<double>()}});
+    const int64_t first = trainer.firstSample();
+    const std::vector<CompletionSample> current = next.valid() ? next.get() : load(first);
+    next = std::async(std::launch::async, load, first + settings.batch);
+    for (size_t k = 0; k < current.size(); ++k) {
+      torch::Generator random = at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(first) + k);
+      const Losses l = sampleLosses(*net, current[k], random);
+      const Tensor total = l.total();
+      trainer.addSample(total, {{"loss", total.item<double>()}, {"coarse", l.coarse.item<double>()},
+                                {"fine", l.fine.item<double>()}, {"linear", l.linear.item<double>()},
+                                {"diffusion", l.diffusion.item<double>()}, {"refinement", l.refinement.item<double>()}});
+    }
+    trainer.update();
     if (trainer.validationDue()) {
       trainer.saveWeights();
       trainer.log(validate(settings.weights_path, held_out, spaces));
     }
     trainer.saveIfDue();
-    if (progress.wasInterrupted(int(100 * trainer.step() / settings.steps))) {
-      trainer.saveCheckpoint();
-      throw Cancelled();
-    }
+    trainer.stopIfInterrupted(progress);
   }
   progress.end();
 }

@@ -61,7 +61,7 @@ struct CompleterNet : torch::nn::Module {
   /// Standardised predictions put back where latents lie: the encoder normalises each token's channel
   /// groups, a mean does not. Without it growth drifts: each level is fed what the last one got wrong.
   Tensor project(const Tensor& z) {
-    return standardise(torch::group_norm(restore(z), config.latent_groups));
+    return config.latent_groups ? standardise(torch::group_norm(restore(z), config.latent_groups)) : z;
   }
   Tensor restore(const Tensor& z) { return z * latent_deviation + latent_mean; }
 

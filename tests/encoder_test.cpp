@@ -2,8 +2,10 @@
 #include "encoder/encoder.h"
 
 #include <gtest/gtest.h>
+#include <unistd.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdlib>
 #include <filesystem>
@@ -434,14 +436,14 @@ TEST(EncoderNet, GaussiansStayNearTheirSubLattice) {  // E11
   torch::NoGradGuard no_grad;
   for (int per_axis : {1, 2, 6}) {
     EncoderConfig c = toyConfig();
-    c.gaussians_per_axis = per_axis;
+    c.gaussians_per_voxel = per_axis * per_axis * per_axis;
     const auto net = makeNet(c, 9);
     net->gaussian_out->weight.mul_(300);  // far beyond what training gives
     const std::vector<Coord> voxels = scatteredCoords(20);
     const float h = .2f;
     const int64_t m = int64_t(per_axis) * per_axis * per_axis;
     const GaussianTensors g =
-        net->gaussians(torch::randn({20, c.voxel_width + 3}), coordTensor(voxels), h);
+        net->gaussians({torch::randn({20, c.voxel_width}), torch::randn({20, 8, 3})}, coordTensor(voxels), h);
     ASSERT_EQ(g.mean.sizes(), (std::vector<int64_t>{20 * m, 3}));
     ASSERT_EQ(g.sh.sizes(), (std::vector<int64_t>{20 * m, 1, 3}));
     double farthest = 0;
@@ -459,6 +461,37 @@ TEST(EncoderNet, GaussiansStayNearTheirSubLattice) {  // E11
     const Tensor scale = g.log_scale.exp() / h;
     EXPECT_GE(scale.min().item<double>(), .02 * (1 - 1e-4));
     EXPECT_LE(scale.max().item<double>(), 1.5 * (1 + 1e-4));
+  }
+}
+
+TEST(EncoderNet, AnyNumberOfGaussiansSharesTheLattice) {  // E11: M
+  for (int64_t m = 1; m <= 70; ++m) {
+    const Tensor lattice = subLattice(m);
+    ASSERT_EQ(lattice.sizes(), (std::vector<int64_t>{m, 3}));
+    std::set<std::array<float, 3>> places;
+    for (int64_t i = 0; i < m; ++i)
+      places.insert({lattice[i][0].item<float>(), lattice[i][1].item<float>(), lattice[i][2].item<float>()});
+    EXPECT_EQ(int64_t(places.size()), m) << "two Gaussians share a cell";
+    EXPECT_GT(lattice.min().item<float>(), 0);
+    EXPECT_LT(lattice.max().item<float>(), 1);
+    // Spread evenly: the centre of all lies within a cell of the voxel's.
+    EXPECT_LE((lattice.mean(0) - .5f).abs().max().item<float>(), 1 / std::ceil(std::cbrt(double(m)) - 1e-9));
+  }
+}
+
+TEST(EncoderNet, OctantsKeepTheirColours) {  // the way around the transformers
+  torch::NoGradGuard no_grad;
+  EncoderConfig c = toyConfig();
+  c.gaussians_per_voxel = 8;
+  const auto net = makeNet(c, 10);
+  net->gaussian_out->weight.zero_();
+  Tensor colours = torch::zeros({1, 8, 3});
+  for (int octant = 0; octant < 8; ++octant) colours[0][octant][0] = .1f * float(octant);  // luminance
+  const GaussianTensors g = net->gaussians({torch::randn({1, c.voxel_width}), colours}, coordTensor({Coord(3, 4, 5)}), 1);
+  for (int64_t i = 0; i < 8; ++i) {
+    const int64_t octant = (g.mean[i][0].item<float>() > 3.5f) * 4 + (g.mean[i][1].item<float>() > 4.5f) * 2 +
+                           (g.mean[i][2].item<float>() > 5.5f);
+    EXPECT_NEAR(g.sh[i][0][1].item<float>() * kSh0, .05f * float(octant), 1e-5);
   }
 }
 
@@ -687,7 +720,7 @@ TEST_F(EncoderFile, BadFilesThrow) {
            [](EncoderConfig& e) { e.heads = 0; }, [](EncoderConfig& e) { e.heads = 5; },
            [](EncoderConfig& e) { e.levels = 3; }, [](EncoderConfig& e) { e.width = -24; },
            [](EncoderConfig& e) { e.latent_groups = 3; }, [](EncoderConfig& e) { e.voxel_m = 0; },
-           [](EncoderConfig& e) { e.gaussians_per_axis = 1000; },
+           [](EncoderConfig& e) { e.gaussians_per_voxel = 1000; },
            [](EncoderConfig& e) { e.patch_px = 0; },
            [](EncoderConfig& e) { e.width = 48; }})  // valid, but not what the tensors are of
     rejected([&](TensorFile& f) {
@@ -710,7 +743,7 @@ TEST(EncoderConfig, JsonRoundTripIsExact) {
 
 TEST(EncoderConfig, PaperSizes) {  // E10, E11
   const EncoderConfig c = EncoderConfig::paper();
-  EXPECT_EQ(c.gaussians_per_axis * c.gaussians_per_axis * c.gaussians_per_axis, 216);
+  EXPECT_EQ(c.gaussians_per_voxel, 216);
   EXPECT_EQ(c.latent_dim, 32);
   EXPECT_EQ(c.latent_groups, 8);
   EXPECT_EQ(c.kl_weight, .1f);
@@ -1010,6 +1043,71 @@ TEST_F(EncoderResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // E13
   EncoderConfig other = c;
   other.kl_weight = .5f;
   EXPECT_THROW(trainEncoder(other, scenes, 5, validation, 0, settings, nullptr, silent), Error);
+}
+
+/// Trains a toy network on rotations of one room's views and returns the log.
+std::vector<TrainLogRow> trainToy(TrainSettings settings, const std::string& folder) {
+  settings.steps = 4, settings.warmup = 1, settings.validate_every = 1, settings.batch = 2;
+  settings.weights_path = folder + "/w.safetensors", settings.work_folder = folder + "/work";
+  const SceneSource scenes = [](uint64_t index) {
+    std::vector<View> views = roomViews(8);
+    std::rotate(views.begin(), views.begin() + std::ptrdiff_t(index % 8), views.end());
+    views.resize(4);
+    return views;
+  };
+  std::vector<TrainLogRow> rows;
+  Progress silent;
+  trainEncoder(toyConfig(), scenes, 5, [](uint64_t) { return roomViews(6); }, 1, settings,
+               [&](const TrainLogRow& row) { rows.push_back(row); }, silent);
+  return rows;
+}
+
+TEST_F(EncoderResume, ABatchesGradientIsTheMeanOfItsSamples) {  // E13
+  auto net = std::make_shared<torch::nn::LinearImpl>(3, 1), average = std::make_shared<torch::nn::LinearImpl>(3, 1);
+  TrainSettings settings;
+  settings.batch = 2, settings.work_folder = path("mean");
+  Trainer trainer(net, average, "toy", "{}", settings, nullptr);
+  const Tensor x = torch::randn({2, 3});
+  for (int i = 0; i < 2; ++i) trainer.addSample((i + 1) * net->forward(x[i]).sum(), {});
+  EXPECT_TRUE(torch::allclose(net->weight.grad(), ((x[0] + 2 * x[1]) / 2).unsqueeze(0)));
+}
+
+TEST_F(EncoderResume, TwoProcessesTrainAsOneWithTheirBatch) {  // E13, data parallel by Gloo
+  const std::vector<TrainLogRow> alone = trainToy({}, path("one"));
+  TrainSettings shared;
+  shared.processes.size = 2, shared.processes.port = uint16_t(20000 + getpid() % 20000);
+  // fork() and threads do not mix: the second process starts over in this program, as the test below.
+  ASSERT_EQ(setenv("VDBC_SECOND_PROCESS", joinText(shared.processes.port, " ", path("two")).c_str(), 1), 0);
+  const std::string program = fs::read_symlink("/proc/self/exe").string();
+  FILE* second = popen((program + " --gtest_also_run_disabled_tests "
+                        "--gtest_filter=EncoderResume.DISABLED_SecondProcess 2>&1").c_str(), "r");
+  ASSERT_NE(second, nullptr);
+  const std::vector<TrainLogRow> together = trainToy(shared, path("two"));
+  std::string output;
+  for (int c; (c = std::fgetc(second)) != EOF;) output += char(c);
+  EXPECT_EQ(pclose(second), 0) << output;
+  ASSERT_EQ(together.size(), alone.size());
+  for (size_t i = 0; i < alone.size(); ++i)
+    for (const char* value : {"loss", "image", "kl", "split", "novel_psnr"})
+      EXPECT_NEAR(together[i].values.at(value), alone[i].values.at(value),
+                  1e-4 * std::abs(alone[i].values.at(value))) << "step " << i + 1 << ", " << value;
+}
+
+TEST_F(EncoderResume, DISABLED_SecondProcess) {
+  std::istringstream text(std::getenv("VDBC_SECOND_PROCESS"));
+  TrainSettings shared;
+  std::string folder;
+  text >> shared.processes.port >> folder;
+  shared.processes.size = 2, shared.processes.rank = 1;
+  EXPECT_TRUE(trainToy(shared, folder + "_second").empty());  // the first process logs
+  EXPECT_FALSE(fs::exists(folder + "_second/w.safetensors"));
+}
+
+TEST_F(EncoderResume, ABatchThatProcessesCannotShareIsRefused) {
+  TrainSettings settings;
+  settings.processes.size = 3;
+  settings.processes.rank = 3;
+  EXPECT_THROW(trainToy(settings, path("bad")), Error);
 }
 
 }  // namespace
