@@ -80,11 +80,23 @@ Tensor tokenPositions(const Tensor& coords, int level, const VoxelFrame& frame) 
   return normalisedPositions((coords.to(torch::kFloat32) + .5f) * token_m, frame);
 }
 
+namespace {
+thread_local bool mixed_precision = false;
+}
+MixedPrecision::MixedPrecision(bool on) : before_(mixed_precision) { mixed_precision = on; }
+MixedPrecision::~MixedPrecision() { mixed_precision = before_; }
+
+Tensor LinearImpl::forward(const Tensor& x) {
+  if (!mixed_precision) return torch::nn::LinearImpl::forward(x);
+  const auto half = torch::kBFloat16;
+  return torch::linear(x.to(half), weight.to(half)).to(torch::kFloat32) + bias;
+}
+
 Attention::Attention(int width, int heads_) : heads(heads_) {
-  query = register_module("query", nn::Linear(width, width));
-  key = register_module("key", nn::Linear(width, width));
-  value = register_module("value", nn::Linear(width, width));
-  output = register_module("output", nn::Linear(width, width));
+  query = register_module("query", Linear(width, width));
+  key = register_module("key", Linear(width, width));
+  value = register_module("value", Linear(width, width));
+  output = register_module("output", Linear(width, width));
 }
 
 namespace {
@@ -146,8 +158,8 @@ Tensor Attention::windowed(const Tensor& x, const Rotary* pos, const Tensor& ord
 }
 
 Mlp::Mlp(int in, int hidden, int out) {
-  first = register_module("first", nn::Linear(in, hidden));
-  second = register_module("second", nn::Linear(hidden, out));
+  first = register_module("first", Linear(in, hidden));
+  second = register_module("second", Linear(hidden, out));
 }
 
 SelfBlock::SelfBlock(int width, int heads) {

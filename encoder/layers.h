@@ -45,6 +45,25 @@ Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame);
 /// The same of the centres of tokens [N, 3] int32 of a tree level.
 Tensor tokenPositions(const Tensor& coords, int level, const VoxelFrame& frame);
 
+/// While it lives, this thread's Linear layers multiply in bfloat16, forward and backward; all else, the
+/// parameters too, stays float32.
+class MixedPrecision {
+ public:
+  explicit MixedPrecision(bool on);
+  ~MixedPrecision();
+  MixedPrecision(const MixedPrecision&) = delete;
+
+ private:
+  bool before_;
+};
+
+/// torch's linear layer that obeys MixedPrecision.
+struct LinearImpl : torch::nn::LinearImpl {
+  using torch::nn::LinearImpl::LinearImpl;
+  Tensor forward(const Tensor& x);
+};
+TORCH_MODULE(Linear);
+
 /// Multi-head attention with separate q, k, v and output projections.
 struct Attention : torch::nn::Module {
   Attention(int width, int heads);
@@ -64,7 +83,7 @@ struct Attention : torch::nn::Module {
   }
 
   int heads;
-  torch::nn::Linear query{nullptr}, key{nullptr}, value{nullptr}, output{nullptr};
+  Linear query{nullptr}, key{nullptr}, value{nullptr}, output{nullptr};
 
  private:
   Tensor attend(const Tensor& q, const Tensor& k, const Tensor& v, const Rotary* q_pos,
@@ -75,7 +94,7 @@ struct Attention : torch::nn::Module {
 struct Mlp : torch::nn::Module {
   Mlp(int in, int hidden, int out);
   Tensor forward(const Tensor& x) { return second->forward(torch::gelu(first->forward(x))); }
-  torch::nn::Linear first{nullptr}, second{nullptr};
+  Linear first{nullptr}, second{nullptr};
 };
 
 /// Pre-norm transformer block: self-attention (windowed, rotary) and MLP.

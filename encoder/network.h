@@ -94,15 +94,15 @@ struct EncoderNet : torch::nn::Module {
   const EncoderConfig config;
   std::shared_ptr<Mlp> voxel_in, gaussian_mlp;
   std::vector<std::shared_ptr<Mlp>> aggregate;
-  torch::nn::Linear position_in{nullptr}, patch_in{nullptr}, geometry_in{nullptr}, posterior{nullptr},
+  Linear position_in{nullptr}, patch_in{nullptr}, geometry_in{nullptr}, posterior{nullptr},
       latent_in{nullptr}, gaussian_out{nullptr};
   // Shallow ways around the transformers, for the mean colours of a token's octants: learned in minutes,
   // where the deep way stayed grey for an hour.
-  torch::nn::Linear feature_shortcut{nullptr}, colour_shortcut{nullptr};
+  Linear feature_shortcut{nullptr}, colour_shortcut{nullptr};
   torch::nn::LayerNorm posterior_norm{nullptr}, decoder_norm{nullptr}, gaussian_norm{nullptr};
   std::vector<std::shared_ptr<BidirectionalBlock>> blocks;
   std::vector<std::shared_ptr<SelfBlock>> decoder_blocks;
-  std::vector<torch::nn::Linear> child_logits, child_tokens;
+  std::vector<Linear> child_logits, child_tokens;
 };
 
 /// Ground truth children plus false positives (E9): count = ratio * truth, half among children next to

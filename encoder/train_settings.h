@@ -27,6 +27,7 @@ struct TrainSettings {
   int64_t steps = 4000;
   int64_t batch = 1;            // samples a step, their gradients averaged; a multiple of the processes
   TrainProcesses processes;
+  bool mixed_precision = false;  // matrix products in bfloat16; parameters and sums stay float32
   double learning_rate = 8e-4;  // peak; linear warm-up, then cosine to 2 %
   int64_t warmup = 150;
   double average_decay = .998;  // of the exponential moving average that is shipped

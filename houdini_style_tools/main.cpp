@@ -57,7 +57,7 @@ struct Train {
   std::vector<std::string> changes;
   int64_t steps = 0, scenes = 0, batch = 1;
   double rate = 0;
-  bool resume = false;
+  bool resume = false, mixed_precision = false;
 };
 
 // "0,3,5-9" -> 0 3 5 6 7 8 9.
@@ -280,7 +280,7 @@ TrainSettings trainSettings(const Train& t, const Common& common) {
   TrainSettings s;
   s.weights_path = t.output;
   s.work_folder = t.work.empty() ? t.output + ".work" : t.work;
-  s.batch = t.batch, s.processes = processes();
+  s.batch = t.batch, s.processes = processes(), s.mixed_precision = t.mixed_precision;
   if (s.batch % s.processes.size != 0)
     throw UsageError(joinText("--batch: expected a multiple of WORLD_SIZE ", s.processes.size, ", found ", s.batch));
   s.steps = t.steps, s.learning_rate = t.rate, s.seed = common.seed, s.resume = t.resume;
@@ -418,6 +418,7 @@ void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rat
   auto* n = verb->add_option("--rooms", t->scenes, joinText("furnished rooms to train on [", rooms, "]"))
                 ->check(CLI::Range(int64_t(1), int64_t(kReservedSeeds)));
   auto* r = verb->add_option("--rate", t->rate, joinText("peak learning rate [", rate, "]"))->check(Between(0, 1));
+  verb->add_flag("--mixed-precision", t->mixed_precision, "matrix products in bfloat16: faster where the CPU has it");
   verb->add_flag("--resume", t->resume, "continue from the checkpoint in the work folder");
   verb->callback([=] {
     if (!s->count()) t->steps = steps;

@@ -17,9 +17,9 @@ Tensor focalLoss(const Tensor& logits, const Tensor& truth, const Tensor& weight
 }
 
 OccupancyHead::OccupancyHead(int width) {
-  first = register_module("first", nn::Linear(width, width));
-  second = register_module("second", nn::Linear(width, width));
-  third = register_module("third", nn::Linear(width, 1));
+  first = register_module("first", Linear(width, width));
+  second = register_module("second", Linear(width, width));
+  third = register_module("third", Linear(width, 1));
 }
 
 Tensor OccupancyHead::forward(const Tensor& h) {
@@ -42,17 +42,17 @@ float snrWeight(SnrWeight kind, float alpha_bar) {
 
 DiffusionHead::DiffusionHead(int width, int latent, int hidden, int steps_)
     : latent_dim(latent), steps(steps_), alpha_bar(torch::tensor(cosineAlphaBar(steps_))) {
-  linear = register_module("linear", nn::Linear(width, latent));
-  in = register_module("in", nn::Linear(latent, hidden));
-  condition = register_module("condition", nn::Linear(width, hidden));
-  time = register_module("time", nn::Linear(64, hidden));
+  linear = register_module("linear", Linear(width, latent));
+  in = register_module("in", Linear(latent, hidden));
+  condition = register_module("condition", Linear(width, hidden));
+  time = register_module("time", Linear(64, hidden));
   for (int i = 0; i < 2; ++i) {
-    modulation.push_back(register_module("modulation" + std::to_string(i), nn::Linear(hidden, 3 * hidden)));
+    modulation.push_back(register_module("modulation" + std::to_string(i), Linear(hidden, 3 * hidden)));
     layers.push_back(register_module("layer" + std::to_string(i),
                                      std::make_shared<Mlp>(hidden, hidden, hidden)));
   }
-  out_modulation = register_module("out_modulation", nn::Linear(hidden, 2 * hidden));
-  out = register_module("out", nn::Linear(hidden, latent));
+  out_modulation = register_module("out_modulation", Linear(hidden, 2 * hidden));
+  out = register_module("out", Linear(hidden, latent));
   zeroStart();
 }
 

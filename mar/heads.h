@@ -13,7 +13,7 @@ Tensor focalLoss(const Tensor& logits, const Tensor& truth, const Tensor& weight
 struct OccupancyHead : torch::nn::Module {
   explicit OccupancyHead(int width);
   Tensor forward(const Tensor& h);  // [N, C] -> [N]
-  torch::nn::Linear first{nullptr}, second{nullptr}, third{nullptr};
+  Linear first{nullptr}, second{nullptr}, third{nullptr};
 };
 
 /// Cosine noise schedule of T steps (Nichol & Dhariwal 2021): alpha_bar[t], t = 0..T-1, falling.
@@ -48,10 +48,10 @@ struct DiffusionHead : torch::nn::Module {
 
   int latent_dim, steps;
   Tensor alpha_bar;  // [T], constant, not a parameter
-  torch::nn::Linear linear{nullptr}, in{nullptr}, condition{nullptr}, time{nullptr}, out{nullptr};
-  std::vector<torch::nn::Linear> modulation;
+  Linear linear{nullptr}, in{nullptr}, condition{nullptr}, time{nullptr}, out{nullptr};
+  std::vector<Linear> modulation;
   std::vector<std::shared_ptr<Mlp>> layers;
-  torch::nn::Linear out_modulation{nullptr};
+  Linear out_modulation{nullptr};
 };
 
 }  // namespace vdbc

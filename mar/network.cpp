@@ -13,11 +13,11 @@ MaskedTransformer::MaskedTransformer(const StageSizes& s, bool rotary_positions_
   for (size_t k = 0; k < kTokenKinds; ++k) {
     // Kinds without features learn one vector: the bias of a linear layer of constant input.
     embed[k] = register_module(std::string("embed_") + kNames[k],
-                               nn::Linear(std::max(1, s.feature_dims[k]), s.width));
+                               Linear(std::max(1, s.feature_dims[k]), s.width));
     embed_norm[k] = register_module(std::string("norm_") + kNames[k],
                                     nn::LayerNorm(nn::LayerNormOptions({s.width})));
   }
-  position_in = register_module("position_in", nn::Linear(kSinusoidalDim, s.width));
+  position_in = register_module("position_in", Linear(kSinusoidalDim, s.width));
   for (int i = 0; i < s.layers; ++i) {
     h1.push_back(register_module("h1_" + std::to_string(i), std::make_shared<SelfBlock>(s.width, s.heads)));
     h2.push_back(register_module("h2_" + std::to_string(i), std::make_shared<SelfBlock>(s.width, s.heads)));

@@ -33,9 +33,9 @@ struct MaskedTransformer : torch::nn::Module {
 
   const StageSizes sizes;
   const bool rotary_positions, position_code;
-  std::array<torch::nn::Linear, kTokenKinds> embed{nullptr, nullptr, nullptr, nullptr};
+  std::array<Linear, kTokenKinds> embed{nullptr, nullptr, nullptr, nullptr};
   std::array<torch::nn::LayerNorm, kTokenKinds> embed_norm{nullptr, nullptr, nullptr, nullptr};
-  torch::nn::Linear position_in{nullptr};
+  Linear position_in{nullptr};
   std::vector<std::shared_ptr<SelfBlock>> h1, h2;
   torch::nn::LayerNorm out_norm{nullptr};
 };
