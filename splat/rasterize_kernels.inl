@@ -843,9 +843,9 @@ VDBC_INLINE void blockMasks(const Splat* splats, const RasterView& v, int n, int
 
 /// alpha of one splat at 16 pixels: 0 where it is below the minimum, at most max_alpha.
 VDBC_INLINE F16 alphaOf(const Splat& s, const RasterView& v, F16 dx, F16 dy) {
-  F16 q = dx * (s.a * dx + s.b * dy) + s.c * dy * dy;
-  q = larger(q, F16{});  // rounding of a needle's form
-  const F16 e = s.log2_opacity - q;
+  // At most the opacity, whatever rounding does to a needle's form.
+  const F16 e = smaller(s.log2_opacity - dx * (s.a * dx + s.b * dy) - s.c * dy * dy,
+                        broadcast(s.log2_opacity));
   const F16 alpha = select(e >= v.log2_min_alpha, exp2Inside(e), F16{});
   return smaller(alpha, broadcast(v.max_alpha));
 }
@@ -1060,25 +1060,26 @@ VDBC_INLINE void blendTileBackwardWith(const TileBackwardJob& job, bool extended
       const float* d_channels = extra.d_blocks + b * extra.count * kLanes;
       for (int first = 0; first < selected_count; first += kBatch) {
         const int m = selected_count - first < kBatch ? selected_count - first : kBatch;
-        F16 alphas[kBatch], weights[kBatch], h_of[kBatch], z_of[kBatch];
+        F16 alphas[kBatch], odds[kBatch], weights[kBatch], h_of[kBatch], z_of[kBatch];
         for (int i = 0; i < m; ++i) {
           const Splat& s = local[selected[first + i]];
           alphas[i] = alphaOf(s, v, x - s.x, y - s.y);
+          odds[i] = alphas[i] / (1.f - alphas[i]);
         }
         for (int i = 0; i < m; ++i) {
           const int k = first + i;
           const Splat& s = local[selected[k]];
           const F16 alpha = alphas[i];
           const F16 wt = alpha * t;
-          F16 value = d_red * s.colour[0] + d_green * s.colour[1] + d_blue * s.colour[2] +
-                      d_z * s.z + d_weight;
+          F16 value = d_weight + d_red * s.colour[0] + d_green * s.colour[1] +
+                      d_blue * s.colour[2] + d_z * s.z;
           if (extended && extra.count) {
             const float* values = extraOf(extra, job.list[done + selected[k]]);
             for (int c = 0; c < extra.count; ++c)
               value += load(d_channels + c * kLanes) * values[c];
           }
           suffix -= wt * value;
-          const F16 h = wt * value - suffix * alpha / (1.f - alpha);
+          const F16 h = wt * value - suffix * odds[i];
           h_of[i] = select(alpha < v.max_alpha, h, zero);
           weights[i] = wt;
           const F16 before = t;
