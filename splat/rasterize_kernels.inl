@@ -229,6 +229,28 @@ VDBC_INLINE void gatherRows(const float* base, const int32_t* index, int stride,
   }
 }
 
+/// rows[i][k] takes lane i of columns[k], k < 4.
+VDBC_INLINE void transposeFour(const F16* columns, float (*rows)[4]) {
+  alignas(64) float lane[4][kLanes];
+  for (int k = 0; k < 4; ++k) store(columns[k], lane[k]);
+  for (int first = 0; first < kLanes; first += 8) {
+    const F8 x = *(const F8*)(lane[0] + first), y = *(const F8*)(lane[1] + first),
+             z = *(const F8*)(lane[2] + first), w = *(const F8*)(lane[3] + first);
+    const F8 xy01 = __builtin_shufflevector(x, y, 0, 8, 1, 9, 4, 12, 5, 13),
+             zw01 = __builtin_shufflevector(z, w, 0, 8, 1, 9, 4, 12, 5, 13),
+             xy23 = __builtin_shufflevector(x, y, 2, 10, 3, 11, 6, 14, 7, 15),
+             zw23 = __builtin_shufflevector(z, w, 2, 10, 3, 11, 6, 14, 7, 15);
+    const F8 r[4] = {__builtin_shufflevector(xy01, zw01, 0, 1, 8, 9, 4, 5, 12, 13),
+                     __builtin_shufflevector(xy01, zw01, 2, 3, 10, 11, 6, 7, 14, 15),
+                     __builtin_shufflevector(xy23, zw23, 0, 1, 8, 9, 4, 5, 12, 13),
+                     __builtin_shufflevector(xy23, zw23, 2, 3, 10, 11, 6, 7, 14, 15)};
+    for (int i = 0; i < 4; ++i) {
+      *(F4*)rows[first + i] = __builtin_shufflevector(r[i], r[i], 0, 1, 2, 3);
+      *(F4*)rows[first + 4 + i] = __builtin_shufflevector(r[i], r[i], 4, 5, 6, 7);
+    }
+  }
+}
+
 /// The sum over lanes of terms[t] goes to lane columnOfTerm(t).
 constexpr int columnOfTerm(int t) { return t % 4 * 4 + t / 4; }
 VDBC_INLINE F16 sumLanes(const F16* terms, int count) {
@@ -554,7 +576,7 @@ static int projectRange(const GaussianArrays& g, const RasterView& v, int64_t be
     constexpr int kTileShift = 4;
     static_assert(1 << kTileShift == kTile, "shift");
     // The members of Splat in order.
-    const F16 members[10] = {px,
+    const F16 members[12] = {px,
                              py,
                              conic_a * (0.5f * kLog2E),
                              conic_b * kLog2E,
@@ -563,10 +585,12 @@ static int projectRange(const GaussianArrays& g, const RasterView& v, int64_t be
                              p.z,
                              larger(p.colour[0], zero),
                              larger(p.colour[1], zero),
-                             larger(p.colour[2], zero)};
-    alignas(64) float lane[10][kLanes], touching[kLanes];
+                             larger(p.colour[2], zero),
+                             zero,
+                             zero};
+    alignas(64) float rows[3][kLanes][4], touching[kLanes];
     alignas(64) int32_t tile[4][kLanes];
-    for (int j = 0; j < 10; ++j) store(members[j], lane[j]);
+    for (int k = 0; k < 3; ++k) transposeFour(members + 4 * k, rows[k]);
     store(touches, touching);
     store(fromBits(x_lo >> kTileShift), (float*)tile[0]);
     store(fromBits(y_lo >> kTileShift), (float*)tile[1]);
@@ -577,9 +601,9 @@ static int projectRange(const GaussianArrays& g, const RasterView& v, int64_t be
       const TileBox box = {uint16_t(tile[0][i]), uint16_t(tile[1][i]), uint16_t(tile[2][i] + 1),
                            uint16_t(tile[3][i] + 1)};
       boxes[count] = box;
-      depths[count] = lane[6][i];
       Splat& s = splats[count];
-      for (int j = 0; j < 10; ++j) (&s.x)[j] = lane[j][i];
+      for (int k = 0; k < 3; ++k) *(F4*)(&s.x + 4 * k) = *(const F4*)rows[k][i];
+      depths[count] = s.z;
       s.width = uint32_t(box.x1 - box.x0);
       s.instance = instances - box.y0 * s.width - box.x0;
       instances += s.width * uint32_t(box.y1 - box.y0);
@@ -750,27 +774,24 @@ static void projectRangeBackward(const GaussianArrays& g, const RasterView& v, c
       const I16 counts = (check == 0.f) & (bad == 0.f) & (load(lane_valid) > 0.f);
       for (int j = 0; j < 6; ++j) pose[j] += select(counts, twist[j], zero);
     }
-    alignas(64) float rows_out[14][kLanes], sane[kLanes], basis[16][kLanes];
+    const F16 columns_out[16] = {d_mean[0],      d_mean[1],      d_mean[2],      d_logit,
+                                 d_log_scale[0], d_log_scale[1], d_log_scale[2], zero,
+                                 d_colour[0],    d_colour[1],    d_colour[2],    zero,
+                                 d_q[0],         d_q[1],         d_q[2],         d_q[3]};
+    alignas(64) float rows_out[4][kLanes][4], sane[kLanes], basis[16][kLanes];
+    for (int k = 0; k < 4; ++k) transposeFour(columns_out + 4 * k, rows_out[k]);
     store(check, sane);
-    for (int j = 0; j < 3; ++j) {
-      store(d_mean[j], rows_out[j]), store(d_log_scale[j], rows_out[3 + j]);
-      store(d_colour[j], rows_out[11 + j]);
-    }
-    for (int j = 0; j < 4; ++j) store(d_q[j], rows_out[6 + j]);
-    store(d_logit, rows_out[10]);
     for (int k = 0; k < coefficients; ++k) store(p.basis[k], basis[k]);
     for (int i = 0; i < lanes; ++i) {
       if (!(sane[i] == 0.f)) continue;
       const size_t n = size_t(batch[i]);
-      for (size_t j = 0; j < 3; ++j) {
-        out.mean[3 * n + j] = rows_out[j][i];
-        out.log_scale[3 * n + j] = rows_out[3 + j][i];
-      }
-      for (size_t j = 0; j < 4; ++j) out.rotation[4 * n + j] = rows_out[6 + j][i];
-      out.opacity_logit[n] = rows_out[10][i];
+      __builtin_memcpy(out.mean + 3 * n, rows_out[0][i], 12);
+      out.opacity_logit[n] = rows_out[0][i][3];
+      __builtin_memcpy(out.log_scale + 3 * n, rows_out[1][i], 12);
+      __builtin_memcpy(out.rotation + 4 * n, rows_out[3][i], 16);
       float* sh = out.sh + n * size_t(3 * coefficients);
       for (int k = 0; k < coefficients; ++k)
-        for (size_t j = 0; j < 3; ++j) *sh++ = basis[k][i] * rows_out[11 + j][i];
+        for (int j = 0; j < 3; ++j) *sh++ = basis[k][i] * rows_out[2][i][j];
     }
     if (!extra_rows) continue;
     for (int i = 0; i < lanes; ++i) {
