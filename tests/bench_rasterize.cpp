@@ -7,6 +7,7 @@
 #include <tbb/parallel_for.h>
 
 #include <algorithm>
+#include <array>
 #include <chrono>
 #include <cmath>
 #include <random>
@@ -131,42 +132,42 @@ VDBC_WIDE float fmaWide(int64_t rounds){VDBC_FMA_CHAINS} VDBC_NARROW
   VDBC_FMA_CHAINS
 }
 
+/// A median, as the rows have.
 template <typename Work>
-double bestSeconds(int tries, Work work) {
-  double best = 1e9;
-  for (int k = 0; k < tries; ++k) {
+double medianSeconds(Work work) {
+  std::array<double, 11> times;
+  for (double& time : times) {
     const double start = seconds();
     tbb::parallel_for(0, kThreads, work, tbb::static_partitioner());
-    best = std::min(best, seconds() - start);
+    time = seconds() - start;
   }
-  return best;
+  std::nth_element(times.begin(), times.begin() + times.size() / 2, times.end());
+  return times[times.size() / 2];
 }
 
 struct Machine {
   double fma_gflops, triad_gbs;
 };
-/// Measured once a run.
-const Machine& machine() {
-  static const Machine measured = [] {
-    constexpr int64_t kRounds = 2000000, kCount = 1 << 24;
-    const double fma_s = bestSeconds(
-        40, [](int) { benchmark::DoNotOptimize(wide() ? fmaWide(kRounds) : fmaNarrow(kRounds)); });
-    std::vector<float> a(kCount), b(kCount, 1.f), c(kCount, 2.f);
-    const double triad_s = bestSeconds(20, [&](int thread) {
-      const int64_t end = kCount * (thread + 1) / kThreads;
-      for (int64_t i = kCount * thread / kThreads; i < end; ++i)
-        a[size_t(i)] = b[size_t(i)] + 3.f * c[size_t(i)];
-      benchmark::ClobberMemory();
-    });
-    return Machine{kThreads * 2. * 16 * 12 * double(kRounds) / fma_s / 1e9,
-                   3. * 4 * double(kCount) / triad_s / 1e9};
-  }();
-  return measured;
+/// Measured anew for each row: what neighbours take on a shared machine changes within seconds.
+Machine measureMachine() {
+  constexpr int64_t kRounds = 2000000, kCount = 1 << 24;
+  const double fma_s = medianSeconds(
+      [](int) { benchmark::DoNotOptimize(wide() ? fmaWide(kRounds) : fmaNarrow(kRounds)); });
+  std::vector<float> a(kCount), b(kCount, 1.f), c(kCount, 2.f);
+  const double triad_s = medianSeconds([&](int thread) {
+    const int64_t end = kCount * (thread + 1) / kThreads;
+    for (int64_t i = kCount * thread / kThreads; i < end; ++i)
+      a[size_t(i)] = b[size_t(i)] + 3.f * c[size_t(i)];
+    benchmark::ClobberMemory();
+  });
+  return {kThreads * 2. * 16 * 12 * double(kRounds) / fma_s / 1e9,
+          3. * 4 * double(kCount) / triad_s / 1e9};
 }
 
 void machineRate(benchmark::State& state, double Machine::*rate, const char* unit) {
-  for (auto _ : state) benchmark::DoNotOptimize(machine().*rate);
-  state.counters[unit] = machine().*rate;
+  Machine machine;
+  for (auto _ : state) machine = measureMachine();
+  state.counters[unit] = machine.*rate;
 }
 
 // --- rows
@@ -247,17 +248,18 @@ void run(benchmark::State& state, const Row& row, bool both, bool everything) {
   state.counters["blocks"] = double(work.blocks);
   state.counters["pairs_per_pixel"] = rounded(double(work.pairs) / (row.width * row.height));
   if (everything) return;
+  const Machine machine = measureMachine();
   const Cost cost = costOf(work, row, both);
   const double floor_ms =
-      std::max(cost.bytes / machine().triad_gbs, cost.flops / machine().fma_gflops) / 1e6;
+      std::max(cost.bytes / machine.triad_gbs, cost.flops / machine.fma_gflops) / 1e6;
   state.counters["MB"] = rounded(cost.bytes / 1e6);
   state.counters["MFLOP"] = rounded(cost.flops / 1e6);
   state.counters["share_of_floor"] = rounded(floor_ms / ms);
   const double probe = both ? row.probe_both : row.probe_forward;
   if (probe == 0) return;
   // The gate: not slower than the probe scaled by whichever rate leaves it the shorter time.
-  const double by_fma = probe * kProbeGflops / machine().fma_gflops,
-               by_triad = probe * kProbeGbs / machine().triad_gbs,
+  const double by_fma = probe * kProbeGflops / machine.fma_gflops,
+               by_triad = probe * kProbeGbs / machine.triad_gbs,
                ratio = ms / std::min(by_fma, by_triad);
   state.counters["probe_by_fma_ms"] = rounded(by_fma);
   state.counters["probe_by_triad_ms"] = rounded(by_triad);
