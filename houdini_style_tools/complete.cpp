@@ -4,7 +4,7 @@
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
-#include <iterator>
+#include <functional>
 
 #include "splat/rasterize.h"
 
@@ -23,15 +23,22 @@ Observation observeScene(const std::vector<View>& views, const Encoder& encoder,
   return observe(views, fitVolume(depth, volume, settings.carving), observing, progress);
 }
 
+Encoding encodeScene(const std::vector<View>& views, const Encoder& encoder,
+                     const SceneSettings& settings, Progress& progress) {
+  progress.start("carve");
+  Encoding e{observeScene(views, encoder, settings, progress), {}};
+  progress.end();
+  progress.start("encode");
+  e.latents = encoder.encode(views, e.observation, progress);
+  progress.end();
+  return e;
+}
+
 Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
                          const Completer& completer, const SceneSettings& settings,
                          Progress& progress) {
-  progress.start("carve");
-  Completion c{observeScene(views, encoder, settings, progress), {}, {}, {}, {}};
-  progress.end();
-  progress.start("encode");
-  c.seen = encoder.encode(views, c.observation, progress);
-  progress.end();
+  Encoding e = encodeScene(views, encoder, settings, progress);
+  Completion c{std::move(e.observation), std::move(e.latents), {}, {}, {}};
   c.whole = completer.complete(c.seen, c.observation.space, settings.completion, progress);
   progress.start("decode");
   c.seen_decoded = encoder.decode(c.seen, c.observation.space, settings.child_threshold, progress);
@@ -136,7 +143,48 @@ Image contactSheet(const std::vector<View>& views, const Completion& completion,
 }
 
 namespace {
-constexpr const char* kEndings[] = {".points.vdb", ".ply", ".png", ".vdb"};
+constexpr const char* kPicture = ".png";
+constexpr const char* kEndings[] = {".points.vdb", ".ply", kPicture, ".vdb"};
+
+// What writes one of a scene's files, by its ending.
+using Writers = std::vector<std::pair<const char*, std::function<void(const std::string&)>>>;
+
+// Everything under other names first: all files appear, or none.
+void writeTogether(const Writers& writers, const std::string& stem, Progress& progress) {
+  progress.start("write");
+  const std::string draft = stem + ".draft";
+  size_t placed = 0;
+  try {
+    for (size_t i = 0; i < writers.size(); ++i) {
+      writers[i].second(draft + writers[i].first);
+      report(progress, int(100 * (i + 1) / writers.size()));
+    }
+    for (; placed < writers.size(); ++placed)
+      fs::rename(draft + writers[placed].first, stem + writers[placed].first);
+  } catch (...) {
+    std::error_code ignored;
+    for (const auto& writer : writers) fs::remove(draft + writer.first, ignored);
+    for (size_t i = 0; i < placed; ++i) fs::remove(stem + writers[i].first, ignored);
+    throw;
+  }
+  progress.end();
+}
+
+// `picture` may be empty: no contact sheet.
+void writeScene(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
+                const std::string& stem, const Eigen::Vector3d& up,
+                const std::function<Image()>& picture, Progress& progress) {
+  const SceneVoxels voxels = sceneVoxels(decoded, latents, space);
+  const Gaussians& g = decoded.gaussians;
+  const int64_t per_voxel = voxels.ijk.empty() ? 0 : g.size() / int64_t(voxels.ijk.size());
+  Writers writers = {
+      {".points.vdb",
+       [&](const std::string& path) { writePointsVdb(g, gaussianProvenance(voxels, per_voxel), path); }},
+      {".ply", [&](const std::string& path) { writePly(g, path, up.cast<float>()); }},
+      {".vdb", [&](const std::string& path) { writeSceneVdb(voxels, path); }}};
+  if (picture) writers.push_back({kPicture, [&](const std::string& path) { writePng(picture(), path); }});
+  writeTogether(writers, stem, progress);
+}
 }  // namespace
 
 void requireCreatable(const std::string& path) {
@@ -156,41 +204,26 @@ void requireCreatable(const std::string& path) {
   std::remove(probe.c_str());
 }
 
-std::string outputStem(const std::string& path) {
+std::string outputStem(const std::string& path, bool with_picture) {
   const fs::path p(path);
   if (p.extension() != ".vdb" || p.stem().empty())
     throw UsageError(joinText("--output: ", path, ": expected a name that ends in .vdb"));
   const std::string stem = (p.has_parent_path() ? p.parent_path() / p.stem() : p.stem()).string();
-  for (const char* ending : kEndings) requireCreatable(stem + ending);
+  for (const char* ending : kEndings)
+    if (with_picture || ending != kPicture) requireCreatable(stem + ending);
   return stem;
 }
 
 void writeCompletion(const std::vector<View>& views, const Completion& c, const std::string& stem,
                      const Eigen::Vector3d& up, Progress& progress) {
-  progress.start("write");
-  const SceneVoxels voxels = sceneVoxels(c.whole_decoded, c.whole, c.observation.space);
-  const Gaussians& g = c.whole_decoded.gaussians;
-  const int64_t per_voxel = voxels.ijk.empty() ? 0 : g.size() / int64_t(voxels.ijk.size());
-  // Everything under other names first: all four files appear, or none.
-  const std::string draft = stem + ".draft";
-  size_t placed = 0;
-  try {
-    writePointsVdb(g, gaussianProvenance(voxels, per_voxel), draft + kEndings[0]);
-    report(progress, 30);
-    writePly(g, draft + kEndings[1], up.cast<float>());
-    report(progress, 50);
-    writePng(contactSheet(views, c, up), draft + kEndings[2]);
-    report(progress, 70);
-    writeSceneVdb(voxels, draft + kEndings[3]);
-    for (; placed < std::size(kEndings); ++placed)
-      fs::rename(draft + kEndings[placed], stem + kEndings[placed]);
-  } catch (...) {
-    std::error_code ignored;
-    for (const char* ending : kEndings) fs::remove(draft + ending, ignored);
-    for (size_t i = 0; i < placed; ++i) fs::remove(stem + kEndings[i], ignored);
-    throw;
-  }
-  progress.end();
+  writeScene(c.whole_decoded, c.whole, c.observation.space, stem, up,
+             [&] { return contactSheet(views, c, up); }, progress);
+}
+
+void writeDecoded(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
+                  const std::string& stem, Progress& progress) {
+  const Eigen::Vector3d up = latents.frame.world_from_grid.linear().col(2);
+  writeScene(decoded, latents, space, stem, up, nullptr, progress);
 }
 
 }  // namespace vdbc

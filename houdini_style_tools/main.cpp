@@ -4,6 +4,7 @@
 #include <tbb/global_control.h>
 
 #include <CLI/CLI.hpp>
+#include <cmath>
 #include <cstdio>
 #include <filesystem>
 #include <nlohmann/json.hpp>
@@ -16,6 +17,7 @@
 #include "houdini_style_tools/evaluate.h"
 #include "houdini_style_tools/render.h"
 #include "houdini_style_tools/scenes.h"
+#include "vdb/latent_vdb.h"
 
 namespace vdbc {
 namespace {
@@ -32,6 +34,7 @@ struct Common {
 struct Complete {
   std::string views, frames, output, weights;
   std::vector<double> up, bounds;
+  double scale = 0;
   double margin = VolumeSettings().margin_m;
   double tau = CompleteSettings().tau, coarse_tau = CompleteSettings().coarse_tau;
   double child_tau = SceneSettings().child_threshold;
@@ -45,8 +48,14 @@ struct Render {
   std::vector<int> size;
   std::vector<double> up;
 };
+struct Decode {
+  std::string latents, output, weights;
+  double child_tau = SceneSettings().child_threshold;
+  bool antialias = false;
+};
 struct Check {
   std::string views, frames, volume;
+  double scale = 0;
 };
 struct Evaluate {
   std::string scenes, frames, weights, lpips, features;
@@ -126,14 +135,46 @@ auto naming(const std::string& source, const Function& function) {
   }
 }
 
+ReadViewsSettings reading(const std::string& frames, double scale) {
+  ReadViewsSettings settings;
+  settings.frames = frameList(frames), settings.metres_per_unit = scale;
+  return settings;
+}
+
+Eigen::Vector3d upOf(const Complete& o) { return o.up.empty() ? conventionalUp(o.views) : upOf(o.up); }
+
+// Where the size of pointmaps is from; for other views {}.
+ordered_json scaleJson(const Complete& o) {
+  if (fs::path(o.views).extension() != ".npz") return ordered_json::object();
+  const PointmapScale s = pointmapScale(o.views, o.scale);
+  return {{"metres_per_unit", s.metres_per_unit}, {"scale_from", s.source}};
+}
+
+double secondsSince(std::chrono::steady_clock::time_point start) {
+  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+}
+
+// One object on stdout, or `text` and the pointmaps' scale.
+void printSummary(bool json, ordered_json summary, const std::string& text,
+                  const ordered_json& scale = ordered_json::object()) {
+  summary.update(scale);
+  if (json)
+    std::printf("%s\n", summary.dump().c_str());
+  else if (scale.empty())
+    std::printf("%s\n", text.c_str());
+  else
+    std::printf("%s\n%g metres per unit of the pointmaps (%s)\n", text.c_str(),
+                scale["metres_per_unit"].get<double>(), scale["scale_from"].get<std::string>().c_str());
+}
+
 void cookComplete(const Complete& o, const Common& common, Progress& progress) {
-  const std::vector<int> frames = frameList(o.frames);
+  const ReadViewsSettings chosen = reading(o.frames, o.scale);
   const std::string stem = outputStem(o.output);
   const std::string weights = weightsFolder(o.weights);
   const auto start = std::chrono::steady_clock::now();
   progress.start("read");
-  const std::vector<View> views = readViews(o.views, {frames, 0});
-  const Eigen::Vector3d up = o.up.empty() ? conventionalUp(o.views) : upOf(o.up);
+  const std::vector<View> views = readViews(o.views, chosen);
+  const Eigen::Vector3d up = upOf(o);
   const SceneSettings settings = sceneSettings(o, common, up);
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
@@ -141,21 +182,70 @@ void cookComplete(const Complete& o, const Common& common, Progress& progress) {
   Completion c = naming(o.views, [&] { return completeScene(views, encoder, completer, settings, progress); });
   for (DecodedGrid* d : {&c.seen_decoded, &c.whole_decoded}) d->gaussians.antialias = o.antialias;
   writeCompletion(views, c, stem, up, progress);
-  const double seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-  if (common.json) {
-    std::printf("%s\n", ordered_json{{"views", views.size()}, {"observed_tokens", c.seen.size()},
-                                     {"generated_tokens", c.whole.size() - c.seen.size()},
-                                     {"voxels", c.whole_decoded.voxels.size()},
-                                     {"gaussians", c.whole_decoded.gaussians.size()},
-                                     {"seconds", seconds}, {"output", stem}}.dump().c_str());
-  } else {
-    std::printf("%zu views: %lld tokens observed, %lld generated; %zu voxels, %lld Gaussians; %.1f s\n"
-                "%s.vdb  %s.points.vdb  %s.ply  %s.png\n",
-                views.size(), static_cast<long long>(c.seen.size()),
-                static_cast<long long>(c.whole.size() - c.seen.size()), c.whole_decoded.voxels.size(),
-                static_cast<long long>(c.whole_decoded.gaussians.size()), seconds, stem.c_str(),
-                stem.c_str(), stem.c_str(), stem.c_str());
-  }
+  const double seconds = secondsSince(start);
+  const int64_t observed = c.seen.size(), generated = c.whole.size() - observed;
+  const size_t voxels = c.whole_decoded.voxels.size();
+  const int64_t gaussians = c.whole_decoded.gaussians.size();
+  printSummary(common.json,
+               {{"views", views.size()}, {"observed_tokens", observed}, {"generated_tokens", generated},
+                {"voxels", voxels}, {"gaussians", gaussians}, {"seconds", seconds}, {"output", stem}},
+               joinText(views.size(), " views: ", observed, " tokens observed, ", generated, " generated; ", voxels,
+                        " voxels, ", gaussians, " Gaussians; ", std::round(seconds * 10) / 10, " s\n", stem, ".vdb  ",
+                        stem, ".points.vdb  ", stem, ".ply  ", stem, ".png"),
+               scaleJson(o));
+}
+
+void cookEncode(const Complete& o, const Common& common, Progress& progress) {
+  constexpr const char* kEnding = ".latent.vdb";
+  const std::string name = fs::path(o.output).filename().string(), ending = kEnding;
+  if (name.size() <= ending.size() || name.compare(name.size() - ending.size(), ending.size(), ending) != 0)
+    throw UsageError(joinText("--output: ", o.output, ": expected a name that ends in ", ending));
+  const ReadViewsSettings chosen = reading(o.frames, o.scale);
+  requireCreatable(o.output);
+  const std::string weights = weightsFolder(o.weights);
+  const auto start = std::chrono::steady_clock::now();
+  progress.start("read");
+  const std::vector<View> views = readViews(o.views, chosen);
+  const Eigen::Vector3d up = upOf(o);
+  const SceneSettings settings = sceneSettings(o, common, up);
+  const Encoder encoder(weights + "/encoder.safetensors");
+  progress.end();
+  const Encoding e = naming(o.views, [&] { return encodeScene(views, encoder, settings, progress); });
+  progress.start("write");
+  writeLatentVdb({e.latents, e.observation.space, encoder.hash()}, o.output);
+  progress.end();
+  const double seconds = secondsSince(start);
+  printSummary(common.json,
+               {{"views", views.size()}, {"tokens", e.latents.size()}, {"seconds", seconds}, {"output", o.output}},
+               joinText(views.size(), " views: ", e.latents.size(), " tokens; ", std::round(seconds * 10) / 10, " s\n",
+                        o.output),
+               scaleJson(o));
+}
+
+void cookDecode(const Decode& o, const Common& common, Progress& progress) {
+  const std::string stem = outputStem(o.output, false);
+  const std::string weights = weightsFolder(o.weights) + "/encoder.safetensors";
+  const auto start = std::chrono::steady_clock::now();
+  progress.start("read");
+  const LatentFile file = readLatentVdb(o.latents);
+  const Encoder encoder(weights);
+  require(file.encoder_hash == encoder.hash(), "decode: ", o.latents, ": expected the weights ", file.encoder_hash,
+          " that made it, found ", encoder.hash(), " in ", weights, " (use --weights)");
+  progress.end();
+  progress.start("decode");
+  DecodedGrid decoded = naming(o.latents, [&] {
+    return encoder.decode(file.latents, file.seen, float(o.child_tau), progress);
+  });
+  decoded.gaussians.antialias = o.antialias;
+  progress.end();
+  writeDecoded(decoded, file.latents, file.seen, stem, progress);
+  const double seconds = secondsSince(start);
+  printSummary(common.json,
+               {{"tokens", file.latents.size()}, {"voxels", decoded.voxels.size()},
+                {"gaussians", decoded.gaussians.size()}, {"seconds", seconds}, {"output", stem}},
+               joinText(file.latents.size(), " tokens: ", decoded.voxels.size(), " voxels, ", decoded.gaussians.size(),
+                        " Gaussians; ", std::round(seconds * 10) / 10, " s\n", stem, ".vdb  ", stem, ".points.vdb  ",
+                        stem, ".ply"));
 }
 
 void cookInfo(const Common& common, int threads) {
@@ -202,7 +292,7 @@ void cookRender(const Render& o, const Common& common, Progress& progress) {
 }
 
 void cookCheck(const Check& o, const Common& common) {
-  const std::vector<View> views = readViews(o.views, {frameList(o.frames), 0});
+  const std::vector<View> views = readViews(o.views, reading(o.frames, o.scale));
   const SceneVoxels voxels = readSceneVdb(o.volume);
   const RayTarget target = RayTarget::fromVoxels(voxels.frame, voxels.ijk);
   const DepthAgreement a = depthAgreement(target, views, 2 * voxels.frame.voxel_m);
@@ -380,11 +470,46 @@ void addCommon(CLI::App* app, Common* c) {
   app->add_flag("--json", c->json, "results (stdout) and progress (stderr) as JSON, one object a line");
 }
 
-void addCompletion(CLI::App* app, Complete* o) {
+void addScale(CLI::App* app, double* scale) {
+  app->add_option("--scale", *scale, "metres per unit of an .npz [from its camera baseline]")->check(Between(1e-6, 1e6));
+}
+
+void addMargin(CLI::App* app, Complete* o) {
   app->add_option("--margin", o->margin, "room around what was seen [m]")->check(Between(0, 100))->capture_default_str();
+}
+
+void addChildTau(CLI::App* app, double* child_tau) {
+  app->add_option("--child-tau", *child_tau, "a voxel of a kept token is kept above this probability")
+      ->check(Between(0, 1))->capture_default_str();
+}
+
+void addAntialias(CLI::App* app, bool* antialias) {
+  app->add_flag("--antialias", *antialias, "splats are for an opacity-compensated low pass; the files say so");
+}
+
+void addWeights(CLI::App* app, std::string* weights) {
+  app->add_option("--weights", *weights, "folder with encoder.safetensors and completer.safetensors");
+}
+
+// What the main job and encode take.
+void addViews(CLI::App* app, Complete* o, const char* output) {
+  const bool required = app->get_parent() != nullptr;  // a verb may stand in for the main job's
+  app->add_option("VIEWS", o->views,
+                  "folder with transforms.json, a transforms.json, EXR file(s) with Z or P, or pointmaps (.npz)")
+      ->required(required);
+  app->add_option("--frames", o->frames, "which of the views, 0,3,5-9 say [all]");
+  app->add_option("-o,--output", o->output, output)->required(required);
+  addWeights(app, &o->weights);
+  app->add_option("--up", o->up, "x y z that points up in the world [the format's]")->expected(3);
+  app->add_option("--bounds", o->bounds, "x0 y0 z0 x1 y1 z1 to complete [seen and margin]")->expected(6);
+  addScale(app, &o->scale);
+}
+
+void addCompletion(CLI::App* app, Complete* o) {
+  addMargin(app, o);
   app->add_option("--tau", o->tau, "a token is kept above this probability")->check(Between(0, 1))->capture_default_str();
   app->add_option("--coarse-tau", o->coarse_tau, "the same for the coarse gate")->check(Between(0, 1))->capture_default_str();
-  app->add_option("--child-tau", o->child_tau, "the same for voxels of a kept token")->check(Between(0, 1))->capture_default_str();
+  addChildTau(app, &o->child_tau);
   app->add_option("--sampling-steps", o->sampling_steps, "diffusion steps, 0 = the linear mean")->check(CLI::Range(0, 1000))->capture_default_str();
   app->add_option("--temperature", o->temperature, "of the diffusion head")->check(Between(0, 10))->capture_default_str();
   app->add_flag("--refine-observed", o->refine_observed, "let the completer rewrite observed latents");
@@ -394,6 +519,7 @@ void addRender(CLI::App* verb, Render* o) {
   RenderSettings& s = o->settings;
   verb->add_option("SPLATS", s.splats, ".ply or .points.vdb")->required();
   verb->add_option("--cameras", s.cameras, "views whose cameras to take");
+  addScale(verb, &s.scale);
   verb->add_option("--turntable", s.turntable, "frames of a turn around the splats")->check(CLI::Range(1, 100000));
   verb->add_option("--flythrough", s.flythrough, "frames of a smooth flight through the --cameras")->check(CLI::Range(1, 100000));
   verb->add_option("--frames", o->frames, "numbers of the frames to render, 0,3,5-9 say [all]");
@@ -433,7 +559,8 @@ int run(int argc, char** argv) {
                "vdb_complete"};
   app.set_version_flag("--version", VDBC_VERSION);
   Common common;
-  Complete complete, eval_options;
+  Complete complete, encode, eval_options;
+  Decode decode;
   Render render;
   Check check;
   Evaluate evaluate;
@@ -441,27 +568,32 @@ int run(int argc, char** argv) {
   app.require_subcommand(0, 1);
 
   addCommon(&app, &common);
-  app.add_option("VIEWS", complete.views, "folder with transforms.json, a transforms.json, or EXR file(s) with Z or P");
-  app.add_option("--frames", complete.frames, "which of the views, 0,3,5-9 say [all]");
-  app.add_option("-o,--output", complete.output, "X.vdb to write, with X.points.vdb, X.ply and X.png beside it");
-  app.add_option("--weights", complete.weights, "folder with encoder.safetensors and completer.safetensors");
-  app.add_option("--up", complete.up, "x y z that points up in the world [the format's]")->expected(3);
-  app.add_flag("--antialias", complete.antialias, "splats are for an opacity-compensated low pass; the files say so");
-  app.add_option("--bounds", complete.bounds, "x0 y0 z0 x1 y1 z1 to complete [seen and margin]")->expected(6);
+  addViews(&app, &complete, "X.vdb to write, with X.points.vdb, X.ply and X.png beside it");
+  addAntialias(&app, &complete.antialias);
   addCompletion(&app, &complete);
 
   CLI::App* info = app.add_subcommand("info", "BLAS, threads, speed and weights");
+  CLI::App* verb_encode = app.add_subcommand("encode", "views as latents: a .latent.vdb for decode");
+  addViews(verb_encode, &encode, "X.latent.vdb to write");
+  addMargin(verb_encode, &encode);
+  CLI::App* verb_decode = app.add_subcommand("decode", "latents as grids and Gaussians");
+  verb_decode->add_option("LATENTS", decode.latents, "X.latent.vdb")->required();
+  verb_decode->add_option("-o,--output", decode.output, "Y.vdb to write, with Y.points.vdb and Y.ply beside it")->required();
+  addWeights(verb_decode, &decode.weights);
+  addChildTau(verb_decode, &decode.child_tau);
+  addAntialias(verb_decode, &decode.antialias);
   CLI::App* verb_render = app.add_subcommand("render", "Gaussians as pictures: from given cameras, around them or along a flight");
   addRender(verb_render, &render);
   CLI::App* verb_check = app.add_subcommand("check", "depth agreement and open directions, by Embree");
   verb_check->add_option("VIEWS", check.views, "views to compare with")->required();
   verb_check->add_option("VOLUME", check.volume, "X.vdb")->required();
   verb_check->add_option("--frames", check.frames, "which of the views [all]");
+  addScale(verb_check, &check.scale);
   CLI::App* verb_eval = app.add_subcommand("eval", "compares all methods on scenes that were never trained on");
   verb_eval->add_option("--scenes", evaluate.scenes, "rooms:SEED-SEED, or a folder with transforms.json")->required();
   verb_eval->add_option("--views", evaluate.views, "input views a scene")->check(CLI::Range(1, 1000))->capture_default_str();
   verb_eval->add_option("--frames", evaluate.frames, "input frames of a folder [--views random ones]");
-  verb_eval->add_option("--weights", evaluate.weights, "folder with encoder.safetensors and completer.safetensors");
+  addWeights(verb_eval, &evaluate.weights);
   verb_eval->add_option("--lpips", evaluate.lpips, "your TorchScript network of two pictures [none]");
   verb_eval->add_option("--features", evaluate.features, "your TorchScript network of one picture, for FID and KID [none]");
   addCompletion(verb_eval, &eval_options);
@@ -472,7 +604,7 @@ int run(int argc, char** argv) {
   CLI::App* train_mar = verb_train->add_subcommand("mar", "the masked auto-regressive completer");
   addTrain(train_mar, &train, 8000, 400, 8e-4);
   train_mar->add_option("--encoder", train.encoder, "encoder weights")->required();
-  for (CLI::App* verb : {info, verb_render, verb_check, verb_eval, train_encoder, train_mar}) addCommon(verb, &common);
+  for (CLI::App* verb : {info, verb_encode, verb_decode, verb_render, verb_check, verb_eval, train_encoder, train_mar}) addCommon(verb, &common);
 
   try {
     app.parse(argc, argv);
@@ -486,6 +618,10 @@ int run(int argc, char** argv) {
   Console console(common.json);
   if (info->parsed()) {
     cookInfo(common, threads);
+  } else if (verb_encode->parsed()) {
+    cookEncode(encode, common, console);
+  } else if (verb_decode->parsed()) {
+    cookDecode(decode, common, console);
   } else if (verb_render->parsed()) {
     cookRender(render, common, console);
   } else if (verb_check->parsed()) {

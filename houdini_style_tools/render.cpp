@@ -98,6 +98,7 @@ std::vector<Frame> framesToRender(const RenderSettings& s, const Gaussians& g) {
   }
   ReadViewsSettings reading;
   reading.cameras_only = true;
+  reading.metres_per_unit = s.scale;
   if (!s.flythrough) reading.frames = s.frames;
   const std::vector<View> views = readViews(s.cameras, reading);
   if (s.flythrough > 0) {

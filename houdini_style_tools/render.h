@@ -14,6 +14,7 @@ namespace vdbc {
 struct RenderSettings {
   std::string splats;   // .ply or .points.vdb
   std::string cameras;  // views whose cameras to take; none for a turntable
+  double scale = 0;     // metres per unit of cameras from an .npz; 0 = as the file says
   std::string output;   // a folder for 0000.png, ..., or a name with #### that ends in .png or .exr
   std::vector<int> frames;  // numbers of those to render; empty = all
   int turntable = 0;        // frames of a full turn around the splats

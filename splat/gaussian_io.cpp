@@ -1,10 +1,7 @@
 #include "splat/gaussian_io.h"
 
-#include <openvdb/io/Archive.h>
-#include <openvdb/io/Stream.h>
 #include <openvdb/openvdb.h>
 #include <openvdb/points/PointAttribute.h>
-#include <openvdb/points/PointDataGrid.h>
 #include <openvdb/points/PointGroup.h>
 #include <tbb/parallel_for.h>
 #include <tbb/parallel_sort.h>
@@ -22,6 +19,8 @@
 #include "splat/image.h"
 #include "vdb/error.h"
 #include "vdb/file_io.h"
+#include "vdb/point_leaves.h"
+#include "vdb/vdb_file.h"
 
 namespace vdbc {
 namespace {
@@ -244,27 +243,19 @@ PlyLayout plyLayout(const PlyElement& vertex, const std::string& path) {
 
 // ---- OpenVDB points
 
-using PointTree = openvdb::points::PointDataTree;
-using PointLeaf = PointTree::LeafNodeType;
-using PointGrid = openvdb::points::PointDataGrid;
 using openvdb::Vec3f;
 using openvdb::math::Quats;
 
-// Pairs of type and codec that every OpenVDB reader has registered (formats.md 2.2).
 using PositionCodec = openvdb::points::FixedPointCodec<false, openvdb::points::PositionRange>;
 using UnitCodec = openvdb::points::FixedPointCodec<false, openvdb::points::UnitRange>;
-using HalfCodec = openvdb::points::TruncateCodec;
-using ExactCodec = openvdb::points::NullCodec;
 
 constexpr std::array<const char*, 3> kShNames = {"GS_SPH_R", "GS_SPH_G", "GS_SPH_B"};
-constexpr float kMaxHalf = 65504.f;
 // The 16-bit fixed-point codecs divide [0, 1] (GS_Alpha) and [-.5, .5] (P, voxels) into such steps
 // and round down: half a step more makes that the nearest.
 constexpr float kFixedStep = 1.f / 65535;
 // From here on half floats have their full 11 bits.
 constexpr float kMinNormalHalf = 6.103515625e-5f;
-// Index coordinates stay within +-2^19 so that a leaf's place and a voxel's place in it fit 64
-// bits.
+// Index coordinates stay within +-2^19: layOutPoints() takes no more.
 constexpr int kIndexBits = 20;
 
 /// Bits of v spread to every third position.
@@ -320,26 +311,6 @@ double pointsVoxelSize(const Gaussians& g, const std::vector<int64_t>& rows) {
   return std::max(smallest, extent * std::exp2(-(level + fraction)));
 }
 
-/// A point's place: leaf and voxel in it in `key`, and its row.
-struct PlacedRow {
-  uint64_t key;
-  int64_t row;
-  bool operator<(const PlacedRow& other) const {
-    return key != other.key ? key < other.key : row < other.row;
-  }
-};
-
-/// Points [begin, end) of the sorted rows lie in `leaf`.
-struct LeafRows {
-  PointLeaf* leaf;
-  size_t begin, end;
-};
-
-template <typename T, typename Codec>
-auto writeHandle(PointLeaf& leaf, const char* name) {
-  return openvdb::points::AttributeWriteHandle<T, Codec>(leaf.attributeArray(name));
-}
-
 float sigmoid(float logit) { return 1.f / (1.f + std::exp(-logit)); }
 
 float logitOf(float probability) {
@@ -372,7 +343,7 @@ bool fitHalf(const Gaussians& g, const std::vector<int64_t>& rows) {
 }
 
 void fillLeaf(const Gaussians& g, const Provenance& provenance,
-              const std::vector<PlacedRow>& placed, const LeafRows& range,
+              const std::vector<int64_t>& sorted, const LeafRows& range,
               const openvdb::math::Transform& transform) {
   PointLeaf& leaf = *range.leaf;
   auto position = writeHandle<Vec3f, PositionCodec>(leaf, "P");
@@ -384,13 +355,13 @@ void fillLeaf(const Gaussians& g, const Provenance& provenance,
   auto completed = leaf.groupWriteHandle("completed");
   const size_t coefficients = size_t(g.shCoefficients());
   for (size_t i = range.begin; i < range.end; ++i) {
-    const size_t row = size_t(placed[i].row);
+    const size_t row = size_t(sorted[i]);
     const auto n = openvdb::Index(i - range.begin);
     const Eigen::Vector3f& mean = g.mean[row];
     const openvdb::Vec3d p_index =
         transform.worldToIndex(openvdb::Vec3d(mean.x(), mean.y(), mean.z()));
     position.set(n, Vec3f(p_index - openvdb::Coord::round(p_index).asVec3d() + 0.5 * kFixedStep));
-    const Eigen::Vector3f sigma = sigmaOf(g, placed[i].row).unaryExpr(&rounded16);
+    const Eigen::Vector3f sigma = sigmaOf(g, sorted[i]).unaryExpr(&rounded16);
     scale.set(n, Vec3f(sigma.x(), sigma.y(), sigma.z()));
     const Eigen::Vector4f q = unitRotation(g.rotation[row]).unaryExpr(&rounded16);
     orient.set(n, Quats(q[1], q[2], q[3], q[0]));  // ours are w x y z, Houdini's x y z w
@@ -406,7 +377,7 @@ void fillLeaf(const Gaussians& g, const Provenance& provenance,
   for (size_t c = 0; c < 3 && g.sh_degree > 0; ++c) {
     auto values = writeHandle<float, HalfCodec>(leaf, kShNames[c]);
     for (size_t i = range.begin; i < range.end; ++i) {
-      const float* sh = g.sh.data() + size_t(placed[i].row) * coefficients * 3;
+      const float* sh = g.sh.data() + size_t(sorted[i]) * coefficients * 3;
       for (size_t k = 0; k < coefficients; ++k) {
         values.set(openvdb::Index(i - range.begin), openvdb::Index(k),
                    std::clamp(sh[3 * k + c], -kMaxHalf, kMaxHalf));
@@ -419,46 +390,15 @@ void fillLeaf(const Gaussians& g, const Provenance& provenance,
 PointTree::Ptr buildPointTree(const Gaussians& g, const Provenance& provenance,
                               const std::vector<int64_t>& rows,
                               const openvdb::math::Transform& transform) {
-  std::vector<PlacedRow> placed(rows.size());
+  std::vector<openvdb::Coord> voxels(rows.size());
   tbb::parallel_for(size_t(0), rows.size(), [&](size_t i) {
     const Eigen::Vector3f& mean = g.mean[size_t(rows[i])];
-    const openvdb::Coord ijk =
+    voxels[i] =
         openvdb::Coord::round(transform.worldToIndex(openvdb::Vec3d(mean.x(), mean.y(), mean.z())));
-    uint64_t leaf = 0;
-    for (int k = 0; k < 3; ++k) {
-      leaf = leaf << (kIndexBits - 2) | uint64_t((ijk[k] + (1 << kIndexBits)) >> 3);
-    }
-    placed[i] = {leaf << 9 | PointLeaf::coordToOffset(ijk), rows[i]};
   });
-  tbb::parallel_sort(placed.begin(), placed.end());
-
-  auto tree = std::make_shared<PointTree>();
-  std::vector<LeafRows> leaves;
-  for (size_t begin = 0; begin < placed.size();) {
-    const uint64_t leaf = placed[begin].key >> 9;
-    size_t end = begin;
-    while (end < placed.size() && placed[end].key >> 9 == leaf) ++end;
-    openvdb::Coord origin;
-    for (int k = 0; k < 3; ++k) {
-      const uint64_t part = leaf >> ((2 - k) * (kIndexBits - 2)) & ((1 << (kIndexBits - 2)) - 1);
-      origin[k] = int(part << 3) - (1 << kIndexBits);
-    }
-    leaves.push_back({tree->touchLeaf(origin), begin, end});
-    begin = end;
-  }
-  const auto descriptor = openvdb::points::AttributeSet::Descriptor::create(
-      openvdb::points::TypedAttributeArray<Vec3f, PositionCodec>::attributeType());
-  tbb::parallel_for(size_t(0), leaves.size(), [&](size_t l) {
-    PointLeaf& leaf = *leaves[l].leaf;
-    std::vector<PointLeaf::ValueType> offsets(PointLeaf::SIZE);  // end of each voxel's points
-    size_t next = leaves[l].begin;
-    for (size_t v = 0; v < offsets.size(); ++v) {
-      while (next < leaves[l].end && (placed[next].key & 511) == v) ++next;
-      offsets[v] = openvdb::PointDataIndex32(uint32_t(next - leaves[l].begin));
-    }
-    leaf.setOffsets(offsets);
-    leaf.initializeAttributes(descriptor, openvdb::Index(leaves[l].end - leaves[l].begin));
-  });
+  auto [tree, sorted, leaves] = layOutPoints(
+      voxels, openvdb::points::TypedAttributeArray<Vec3f, PositionCodec>::attributeType());
+  for (int64_t& row : sorted) row = rows[size_t(row)];
   if (leaves.empty()) return tree;
   if (fitHalf(g, rows)) {
     openvdb::points::appendAttribute<Vec3f, HalfCodec>(*tree, "scale");
@@ -475,8 +415,9 @@ PointTree::Ptr buildPointTree(const Gaussians& g, const Provenance& provenance,
   }
   openvdb::points::appendAttribute<float, ExactCodec>(*tree, "probability");
   openvdb::points::appendGroup(*tree, "completed");
-  tbb::parallel_for(size_t(0), leaves.size(),
-                    [&](size_t l) { fillLeaf(g, provenance, placed, leaves[l], transform); });
+  tbb::parallel_for(size_t(0), leaves.size(), [&, &sorted = sorted, &leaves = leaves](size_t l) {
+    fillLeaf(g, provenance, sorted, leaves[l], transform);
+  });
   openvdb::points::compactAttributes(*tree);
   return tree;
 }
@@ -486,12 +427,6 @@ struct SplatLeaf {
   const PointLeaf* leaf;
   size_t first_row;
 };
-
-template <typename T>
-auto readHandle(const PointLeaf& leaf, const char* name) {
-  // Throws openvdb::TypeError where the attribute has another type.
-  return openvdb::points::AttributeHandle<T>(leaf.constAttributeArray(name));
-}
 
 /// The highest degree with a coefficient other than zero: what files by others leave to be found
 /// out.
@@ -562,7 +497,7 @@ void readLeaf(const SplatLeaf& source, const openvdb::math::Transform& transform
     }
   }
   if (!provenance) return;
-  if (descriptor.find("probability") != openvdb::points::AttributeSet::INVALID_POS) {
+  if (hasAttribute(leaf, "probability")) {
     const auto probability = readHandle<float>(leaf, "probability");
     for (openvdb::Index n = 0; n < begin; ++n) {
       provenance->probability[source.first_row + n] = probability.get(n);
@@ -576,42 +511,11 @@ void readLeaf(const SplatLeaf& source, const openvdb::math::Transform& transform
   }
 }
 
-/// A view of bytes as a stream, without a copy.
-class MemoryBuffer : public std::streambuf {
- public:
-  explicit MemoryBuffer(const std::vector<uint8_t>& bytes) {
-    char* begin = reinterpret_cast<char*>(const_cast<uint8_t*>(bytes.data()));  // only read
-    setg(begin, begin, begin + bytes.size());
-  }
-
- protected:
-  pos_type seekoff(off_type offset, std::ios_base::seekdir from, std::ios_base::openmode) override {
-    const off_type base = from == std::ios_base::beg   ? 0
-                          : from == std::ios_base::cur ? gptr() - eback()
-                                                       : egptr() - eback();
-    if (base + offset < 0 || base + offset > egptr() - eback()) return pos_type(off_type(-1));
-    setg(eback(), eback() + base + offset, egptr());
-    return base + offset;
-  }
-  pos_type seekpos(pos_type position, std::ios_base::openmode mode) override {
-    return seekoff(off_type(position), std::ios_base::beg, mode);
-  }
-};
-
 /// The points grid `splats`, or else the first points grid.
-PointGrid::Ptr readPointGrid(const std::vector<uint8_t>& bytes, const std::string& path) {
-  openvdb::initialize();
-  require(checksumMatches(bytes), "readPointsVdb: ", path,
-          ": corrupt (its checksum does not match)");
-  MemoryBuffer buffer(bytes);
-  std::istream in(&buffer);
-  // OpenVDB does not look whether a read succeeded: let the stream throw at its end.
-  in.exceptions(std::ios::failbit | std::ios::badbit | std::ios::eofbit);
-  openvdb::io::Stream stream(in, /*delayLoad=*/false);
-  const openvdb::GridPtrVecPtr grids = stream.getGrids();
+PointGrid::Ptr findSplats(const openvdb::GridPtrVec& grids, const std::string& path) {
   PointGrid::Ptr chosen;
   std::string found;
-  for (const openvdb::GridBase::Ptr& grid : *grids) {
+  for (const openvdb::GridBase::Ptr& grid : grids) {
     if (!grid) continue;
     found += (found.empty() ? "" : ", ") + grid->getName() + " (" + grid->type() + ")";
     if (grid->isType<PointGrid>() && (!chosen || grid->getName() == "splats")) {
@@ -623,23 +527,12 @@ PointGrid::Ptr readPointGrid(const std::vector<uint8_t>& bytes, const std::strin
   return chosen;
 }
 
-/// Writes to any stream; OpenVDB's File does not look whether everything arrived on the disk.
-class SeekableArchive : public openvdb::io::Archive {
- public:
-  void writeTo(std::ostream& out, const openvdb::GridCPtrVec& grids) const {
-    openvdb::io::Archive::write(out, grids, /*seekable=*/true, openvdb::MetaMap());
-  }
-};
-
 Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenance* provenance) {
   std::vector<SplatLeaf> leaves;
   size_t count = 0;
   bool has_sh = true;
   for (auto leaf = grid.tree().cbeginLeaf(); leaf; ++leaf) {
-    const auto& attributes = leaf->attributeSet();
-    const auto has = [&](const char* name) {
-      return attributes.descriptor().find(name) != openvdb::points::AttributeSet::INVALID_POS;
-    };
+    const auto has = [&](const char* name) { return hasAttribute(*leaf, name); };
     for (const char* name : {"P", "scale", "orient", "GS_Alpha"}) {
       require(has(name), "readPointsVdb: ", path, ": no splats: points grid ", grid.getName(),
               " has no attribute ", name,
@@ -648,13 +541,7 @@ Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenanc
     has_sh = has_sh && has(kShNames[0]) && has(kShNames[1]) && has(kShNames[2]);
     require(has_sh || has("Cd"), "readPointsVdb: ", path, ": no splats: points grid ",
             grid.getName(), " has no colour (expected GS_SPH_R/G/B or Cd)");
-    leaf->validateOffsets();
-    const size_t points = size_t(leaf->getLastValue());
-    for (size_t a = 0; a < attributes.size(); ++a) {
-      require(attributes.getConst(a)->size() >= points, "readPointsVdb: ", path,
-              ": corrupt: a leaf has ", points, " points but ", attributes.getConst(a)->size(),
-              " values of an attribute");
-    }
+    const size_t points = checkedPointCount("readPointsVdb", *leaf, path);
     leaves.push_back({&*leaf, count});
     count += points;
   }
@@ -670,10 +557,9 @@ Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenanc
   const auto mode = grid.getMetadata<openvdb::StringMetadata>(kModeKey);
   g.antialias = mode && mode->value() == kAntialiasedMode;
   if (provenance) {
-    const auto* first = leaves.empty() ? nullptr : &leaves[0].leaf->attributeSet().descriptor();
-    provenance->recorded =
-        first && (first->hasGroup("completed") ||
-                  first->find("probability") != openvdb::points::AttributeSet::INVALID_POS);
+    const PointLeaf* first = leaves.empty() ? nullptr : leaves[0].leaf;
+    provenance->recorded = first && (first->attributeSet().descriptor().hasGroup("completed") ||
+                                     hasAttribute(*first, "probability"));
     provenance->generated.assign(count, 0);
     provenance->probability.assign(count, 1.f);
   }
@@ -795,11 +681,11 @@ void writePointsVdb(const Gaussians& g, const Provenance& provenance, const std:
                             }),
              rows.end());
   openvdb::initialize();
-  std::string bytes;
+  PointGrid::Ptr grid;
   try {
     const auto transform =
         openvdb::math::Transform::createLinearTransform(pointsVoxelSize(g, rows));
-    auto grid = PointGrid::create(buildPointTree(g, provenance, rows, *transform));
+    grid = PointGrid::create(buildPointTree(g, provenance, rows, *transform));
     grid->setTransform(transform);
     grid->setName("splats");
     grid->setCreator("vdb_complete");
@@ -812,20 +698,16 @@ void writePointsVdb(const Gaussians& g, const Provenance& provenance, const std:
     grid->insertMeta("sh_degree", openvdb::Int32Metadata(g.sh_degree));
     grid->insertMeta(kModeKey,
                      openvdb::StringMetadata(g.antialias ? kAntialiasedMode : kDefaultMode));
-    std::ostringstream archive;
-    SeekableArchive().writeTo(archive, {grid});
-    bytes = archive.str();
-  } catch (const std::exception& error) {
+  } catch (const openvdb::Exception& error) {
     throw Error(joinText(kOperation, ": ", path, ": cannot encode: ", error.what()));
   }
-  bytes += checksumTrailer(bytes.data(), bytes.size());
-  writeFile(kOperation, path, bytes.data(), bytes.size());
+  writeVdb(kOperation, path, {grid}, {});
 }
 
 Gaussians readPointsVdb(const std::string& path, Provenance* provenance) {
-  const std::vector<uint8_t> bytes = readFile("readPointsVdb", path, kMaxFileBytes);
+  const openvdb::GridPtrVec grids = readVdb("readPointsVdb", path, kMaxFileBytes).grids;
   try {
-    return gatherPoints(*readPointGrid(bytes, path), path, provenance);
+    return gatherPoints(*findSplats(grids, path), path, provenance);
   } catch (const Error&) {
     throw;
   } catch (const std::exception& error) {  // OpenVDB's own

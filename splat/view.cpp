@@ -10,21 +10,20 @@
 #include <ImfMultiPartInputFile.h>
 #include <ImfOutputFile.h>
 #include <ImfPartType.h>
-#include <tbb/parallel_for.h>
 
 #include <Eigen/LU>
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdio>
-#include <exception>
 #include <filesystem>
 #include <limits>
 #include <nlohmann/json.hpp>
 #include <optional>
 
-#include "vdb/file_io.h"
+#include "splat/view_reading.h"
 #include "vdb/error.h"
+#include "vdb/file_io.h"
 
 namespace vdbc {
 namespace {
@@ -32,15 +31,14 @@ namespace {
 namespace fs = std::filesystem;
 using Json = nlohmann::json;
 
-constexpr const char* kRead = "readViews";
+constexpr const char* kRead = kReadViews;
 constexpr uint64_t kMaxJsonBytes = uint64_t(1) << 28;
-constexpr uint64_t kMaxPixels = uint64_t(1) << 28;
-constexpr double kRigidTolerance = 5e-3;  // poses in the wild have as few as four decimals
-constexpr float kFarDepth = 1e9f;         // renderers fill empty pixels with 1e10 and the like
-constexpr uint16_t kNoDepth16 = 65535;    // Kinect captures mark unmeasured pixels so
+constexpr uint64_t kMaxPixels = kMaxViewPixels;
+constexpr double kRigidTolerance = 5e-3;
+constexpr uint16_t kNoDepth16 = 65535;  // Kinect captures mark unmeasured pixels so
 
-/// The rigid transform nearest to `m`: the rotation of its polar decomposition. Throws Error unless
-/// m is rigid up to kRigidTolerance.
+}  // namespace
+
 Eigen::Isometry3d rigid(const Eigen::Matrix4d& m, const std::string& path,
                         const std::string& what) {
   Eigen::Matrix3d r = m.topLeftCorner<3, 3>();
@@ -62,7 +60,26 @@ Eigen::Isometry3d rigid(const Eigen::Matrix4d& m, const std::string& path,
   return result;
 }
 
-/// Applies settings.max_side and requires what every View promises.
+std::vector<float> depthFromPositions(const Image& positions, const Camera& camera) {
+  std::vector<float> depth(size_t(camera.width) * size_t(camera.height), 0.f);
+  const Eigen::Isometry3d camera_from_world = camera.world_from_camera.inverse();
+  constexpr double kHalfPixel = 0.5 + 1e-3;  // float rounding of a position at the pixel's border
+  for (int y = 0; y < camera.height; ++y) {
+    for (int x = 0; x < camera.width; ++x) {
+      const Eigen::Vector3d world(positions.at(x, y, 0), positions.at(x, y, 1),
+                                  positions.at(x, y, 2));
+      if (!world.allFinite()) continue;
+      const Eigen::Vector3d p = camera_from_world * world;
+      if (!(p.z() > 0 && p.z() < double(kFarDepth))) continue;
+      const double u = camera.fx * p.x() / p.z() + camera.cx;
+      const double v = camera.fy * p.y() / p.z() + camera.cy;
+      if (std::abs(u - (x + 0.5)) > kHalfPixel || std::abs(v - (y + 0.5)) > kHalfPixel) continue;
+      depth[size_t(y) * size_t(camera.width) + size_t(x)] = float(p.z());
+    }
+  }
+  return depth;
+}
+
 void finishView(View* view, const ReadViewsSettings& settings, const std::string& path) {
   const bool measured =
       std::any_of(view->depth.begin(), view->depth.end(), [](float z) { return z > 0; });
@@ -88,16 +105,6 @@ void finishView(View* view, const ReadViewsSettings& settings, const std::string
   view->camera = resized(view->camera, new_w, new_h);
 }
 
-Image threeChannels(Image image) {
-  if (image.channels == 3) return image;
-  Image rgb(image.width, image.height, 3);
-  for (size_t i = 0; i < image.data.size(); ++i) {
-    for (size_t c = 0; c < 3; ++c) rgb.data[3 * i + c] = image.data[i];
-  }
-  return rgb;
-}
-
-/// Which of `count` frames to read, checked.
 std::vector<size_t> selectFrames(const ReadViewsSettings& settings, size_t count,
                                  const std::string& path) {
   require(count > 0, kRead, ": ", path, ": no frames");
@@ -113,23 +120,15 @@ std::vector<size_t> selectFrames(const ReadViewsSettings& settings, size_t count
   return selected;
 }
 
-/// Reads frames in parallel; of several errors the first frame's is thrown, whatever the threads
-/// do.
-template <typename ReadOne>
-std::vector<View> readAll(const std::vector<size_t>& frames, const ReadOne& readOne) {
-  std::vector<View> views(frames.size());
-  std::vector<std::exception_ptr> errors(frames.size());
-  tbb::parallel_for(size_t(0), frames.size(), [&](size_t i) {
-    try {
-      views[i] = readOne(frames[i]);
-    } catch (...) {
-      errors[i] = std::current_exception();
-    }
-  });
-  for (const auto& error : errors) {
-    if (error) std::rethrow_exception(error);
+namespace {
+
+Image threeChannels(Image image) {
+  if (image.channels == 3) return image;
+  Image rgb(image.width, image.height, 3);
+  for (size_t i = 0; i < image.data.size(); ++i) {
+    for (size_t c = 0; c < 3; ++c) rgb.data[3 * i + c] = image.data[i];
   }
-  return views;
+  return rgb;
 }
 
 // ---- nerfstudio transforms.json
@@ -534,27 +533,6 @@ Camera exrCamera(const Imf::MultiPartInputFile& file, int width, int height,
   return camera;
 }
 
-/// Planar depth from world positions; a point that does not reproject into its own pixel is none.
-std::vector<float> depthFromPositions(const Image& positions, const Camera& camera) {
-  std::vector<float> depth(size_t(camera.width) * size_t(camera.height), 0.f);
-  const Eigen::Isometry3d camera_from_world = camera.world_from_camera.inverse();
-  constexpr double kHalfPixel = 0.5 + 1e-3;  // float rounding of a position at the pixel's border
-  for (int y = 0; y < camera.height; ++y) {
-    for (int x = 0; x < camera.width; ++x) {
-      const Eigen::Vector3d world(positions.at(x, y, 0), positions.at(x, y, 1),
-                                  positions.at(x, y, 2));
-      if (!world.allFinite()) continue;
-      const Eigen::Vector3d p = camera_from_world * world;
-      if (!(p.z() > 0 && p.z() < double(kFarDepth))) continue;
-      const double u = camera.fx * p.x() / p.z() + camera.cx;
-      const double v = camera.fy * p.y() / p.z() + camera.cy;
-      if (std::abs(u - (x + 0.5)) > kHalfPixel || std::abs(v - (y + 0.5)) > kHalfPixel) continue;
-      depth[size_t(y) * size_t(camera.width) + size_t(x)] = float(p.z());
-    }
-  }
-  return depth;
-}
-
 View decodeExr(const std::string& path, const std::string& name,
                const ReadViewsSettings& settings) {
   const uint64_t file_bytes = fs::file_size(path);
@@ -636,7 +614,8 @@ View readExr(const std::string& path, const std::string& name, const ReadViewsSe
 /// What a path given to readViews() holds.
 struct Source {
   std::string transforms;      // the transforms.json, or
-  std::vector<fs::path> exrs;  // EXR files, sorted by name
+  std::vector<fs::path> exrs;  // EXR files, sorted by name, or
+  std::string pointmaps;       // the .npz
 };
 
 Source findSource(const std::string& path) {
@@ -664,9 +643,11 @@ Source findSource(const std::string& path) {
     source.transforms = path;
   } else if (extension == ".exr") {
     source.exrs.push_back(path);
+  } else if (extension == ".npz") {
+    source.pointmaps = path;
   } else {
-    throw Error(
-        joinText(kRead, ": ", path, ": expected a folder, a transforms.json or an .exr file"));
+    throw Error(joinText(kRead, ": ", path,
+                         ": expected a folder, a transforms.json, an .exr or an .npz file"));
   }
   return source;
 }
@@ -701,6 +682,9 @@ Json poseJson(const Camera& camera) {
 
 std::vector<View> readViews(const std::string& path, const ReadViewsSettings& settings) {
   const Source source = findSource(path);
+  if (!source.pointmaps.empty()) return readPointmaps(path, settings);
+  require(settings.metres_per_unit == 0, kRead, ": ", path,
+          ": is in metres already (expected a scale for .npz only)");
   if (!source.transforms.empty()) return readTransforms(source.transforms, settings);
   return readAll(selectFrames(settings, source.exrs.size(), path), [&](size_t i) {
     return readExr(source.exrs[i].string(), source.exrs[i].filename().string(), settings);
@@ -709,6 +693,7 @@ std::vector<View> readViews(const std::string& path, const ReadViewsSettings& se
 
 Eigen::Vector3d conventionalUp(const std::string& path) {
   const Source source = findSource(path);
+  if (!source.pointmaps.empty()) return pointmapUp(path);
   if (source.transforms.empty()) return Eigen::Vector3d::UnitY();
   const Applied applied = appliedTransform(parseTransforms(source.transforms), source.transforms);
   return applied.file_from_source.linear().transpose() * Eigen::Vector3d::UnitZ();

@@ -25,6 +25,7 @@
 #include "splat/view.h"
 #include "tests/simple_room.h"
 #include "vdb/error.h"
+#include "vdb/latent_vdb.h"
 #include "vdb/scene_volume.h"
 
 #ifndef VDBC_WEIGHTS
@@ -252,7 +253,7 @@ TEST_F(Program, FramesOutOfRangeNameTheViews) {
 
 TEST_F(Program, HelpOfEveryVerbListsTheCommonOptions) {
   const std::vector<Args> verbs = {
-      {}, {"info"}, {"render"}, {"check"}, {"eval"}, {"train", "encoder"}, {"train", "mar"}};
+      {}, {"info"}, {"encode"}, {"decode"}, {"render"}, {"check"}, {"eval"}, {"train", "encoder"}, {"train", "mar"}};
   for (Args args : verbs) {
     args.push_back("--help");
     SCOPED_TRACE(testing::PrintToString(args));
@@ -511,6 +512,71 @@ TEST_F(Program, ObservedVoxelsAreTheCarvedViews) {
   }
   EXPECT_EQ(stages,
             (std::set<std::string>{"carve", "complete", "decode", "encode", "read", "write"}));
+}
+
+TEST_F(Program, EncodeThenDecodeWritesWhatWasSeen) {
+  NEEDS_WEIGHTS();
+  const std::string views = writeRoom("views"), latents = output_ + "/x.latent.vdb";
+  const Ended encoded = run({"encode", views, "-o", latents, "--weights", VDBC_WEIGHTS, "--json"});
+  ASSERT_EQ(encoded.code, kOk) << encoded.err;
+  EXPECT_EQ(listing(output_), Args{"x.latent.vdb"});
+  const LatentFile file = readLatentVdb(latents);
+  const json said = json::parse(encoded.out);
+  EXPECT_EQ(said.at("tokens"), file.latents.size());
+  EXPECT_EQ(said.at("output"), latents);
+  EXPECT_GT(said.at("seconds").get<double>(), 0);
+  EXPECT_EQ(file.encoder_hash.size(), 16u);
+
+  const Ended decoded =
+      run({"decode", latents, "-o", output_ + "/y.vdb", "--weights", VDBC_WEIGHTS, "--json"});
+  ASSERT_EQ(decoded.code, kOk) << decoded.err;
+  EXPECT_EQ(listing(output_), (Args{"x.latent.vdb", "y.ply", "y.points.vdb", "y.vdb"}));
+  const SceneVoxels voxels = readSceneVdb(output_ + "/y.vdb");
+  std::set<Coord> observed;
+  for (size_t i = 0; i < voxels.ijk.size(); ++i)
+    if (voxels.observed[i]) observed.insert(voxels.ijk[i]);
+  const std::vector<Coord> filled = activeCoords(file.seen.filled);
+  EXPECT_EQ(observed, std::set<Coord>(filled.begin(), filled.end()));
+  const json result = json::parse(decoded.out);
+  EXPECT_EQ(result.at("tokens"), file.latents.size());
+  EXPECT_EQ(result.at("voxels"), voxels.ijk.size());
+  EXPECT_EQ(result.at("gaussians"), readPly(output_ + "/y.ply").size());
+  // The place looks as it did.
+  const View view = readViews(views)[0];
+  const Image seen = rasterize(readPly(output_ + "/y.ply"), view.camera, {}).colour;
+  EXPECT_GT(psnr(seen, view.colour), psnr(Image(64, 48, 3, .5f), view.colour) + 3);
+}
+
+TEST_F(Program, DecodeRefusesOtherWeightsAndFiles) {
+  NEEDS_WEIGHTS();
+  LatentFile file;
+  file.encoder_hash = "fedcba9876543210";
+  file.latents.dim = 32;
+  file.latents.frame.bounds = CoordBBox(Coord(0), Coord(7));
+  file.latents.ijk = {Coord(1, 2, 3)};
+  file.latents.z.assign(32, 0.f);
+  file.latents.observed = {1}, file.latents.probability = {1}, file.latents.bfs_level = {0};
+  writeLatentVdb(file, at("other.latent.vdb"));
+  const auto decode = [&](const std::string& latents, const std::string& output) {
+    return Args{"decode", latents, "-o", output, "--weights", VDBC_WEIGHTS};
+  };
+  const std::string y = output_ + "/y.vdb";
+  expectFailure(decode(at("other.latent.vdb"), y), kFailed, "fedcba9876543210");
+  expectFailure(decode(writeVolume(), y), kFailed, at("volume.vdb"));
+  expectFailure(decode(at("missing.latent.vdb"), y), kFailed, at("missing.latent.vdb"));
+  const std::string whole = readText(at("other.latent.vdb"));
+  writeText(at("cut.latent.vdb"), whole.substr(0, whole.size() / 2));
+  expectFailure(decode(at("cut.latent.vdb"), y), kFailed, at("cut.latent.vdb"));
+  expectFailure(decode(at("other.latent.vdb"), output_ + "/y.ply"), kUsage, "y.ply");
+  expectFailure({"decode", at("other.latent.vdb")}, kUsage, "--output");
+  const std::string views = writeRoom("views");
+  expectFailure({"encode", views, "-o", output_ + "/x.vdb", "--weights", VDBC_WEIGHTS}, kUsage,
+                ".latent.vdb");
+  expectFailure({"encode", views}, kUsage, "--output");
+  expectFailure({"encode", at("missing"), "-o", output_ + "/x.latent.vdb", "--weights", VDBC_WEIGHTS},
+                kFailed, at("missing"));
+  expectFailure(complete(views, {"--scale", "2"}), kFailed, "metres already");
+  expectFailure(complete(views, {"--scale", "0"}), kUsage, "--scale");
 }
 
 TEST_F(Program, TheSeedFixesEveryByteOfThePly) {

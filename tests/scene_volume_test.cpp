@@ -18,6 +18,7 @@
 #include <random>
 #include <set>
 
+#include "tests/files.h"
 #include "vdb/grid_instances.h"
 
 namespace vdbc {
@@ -252,16 +253,6 @@ TEST(FitVolume, BadInputThrows) {
 
 // --- files ---
 
-struct TemporaryFolder {
-  fs::path path;
-  TemporaryFolder() {
-    std::string name = (fs::temp_directory_path() / "scene_volume_test.XXXXXX").string();
-    path = mkdtemp(name.data());
-  }
-  ~TemporaryFolder() { fs::remove_all(path); }
-  std::string operator/(const std::string& name) const { return (path / name).string(); }
-};
-
 VoxelFrame turnedFrame() {
   VoxelFrame frame;
   frame.voxel_m = 0.05f;
@@ -449,14 +440,6 @@ TEST(SceneVdb, GeneratedVoxelsDoNotCloseWhatWasSeenEmpty) {
   EXPECT_LT(surface->tree().getValue(voxels.ijk[observed]), 0.f);
 }
 
-std::string bytesOf(const std::string& path) {
-  std::ifstream in(path, std::ios::binary);
-  return {std::istreambuf_iterator<char>(in), {}};
-}
-void writeBytes(const std::string& path, const std::string& bytes) {
-  std::ofstream(path, std::ios::binary | std::ios::trunc) << bytes;
-}
-
 /// Small, and in one node of the root: quick to read often.
 SceneVoxels smallScene() {
   VoxelFrame frame = turnedFrame();
@@ -597,18 +580,6 @@ TEST(SceneVdb, FailedWritesThrowAndLeaveNothing) {
 }
 
 // --- other programs ---
-
-/// Standard output and error of a command, or nothing where it failed.
-std::string outputOf(const std::string& command) {
-  std::string text;
-  FILE* pipe = popen((command + " 2>&1").c_str(), "r");
-  if (!pipe) return {};
-  std::array<char, 4096> buffer;
-  while (size_t n = fread(buffer.data(), 1, buffer.size(), pipe)) text.append(buffer.data(), n);
-  return pclose(pipe) == 0 ? text : std::string();
-}
-
-bool installed(const std::string& program) { return !outputOf("command -v " + program).empty(); }
 
 TEST(SceneVdb, VdbPrintOpensIt) {
   if (!installed("vdb_print")) GTEST_SKIP() << "vdb_print is not installed";

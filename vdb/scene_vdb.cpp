@@ -1,5 +1,4 @@
 // The files of scene_volume.h. Slow to compile, like everything that walks several types of trees.
-#include <openvdb/io/Stream.h>
 #include <openvdb/math/Maps.h>
 #include <openvdb/openvdb.h>
 #include <tbb/parallel_for.h>
@@ -7,11 +6,10 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <sstream>
 
-#include "vdb/file_io.h"
 #include "vdb/grid_instances.h"
 #include "vdb/scene_volume.h"
+#include "vdb/vdb_file.h"
 
 namespace vdbc {
 namespace {
@@ -21,7 +19,7 @@ using Eigen::Vector3d;
 
 constexpr int kBandVoxels = 3;  // half width of `surface`, formats.md 2.3
 
-// Names of the grids and of the file's metadata: the format, shared by writer and reader.
+// Names of the grids: the format, shared by writer and reader.
 constexpr const char* kSurface = "surface";
 constexpr const char* kDensity = "density";
 constexpr const char* kColour = "Cd";
@@ -30,32 +28,6 @@ constexpr const char* kGenerated = "generated";
 constexpr const char* kProbability = "probability";
 constexpr const char* kBfsLevel = "bfs_level";
 constexpr const char* kSeenEmpty = "seen_empty";
-constexpr const char* kVoxelM = "voxel_m";
-constexpr const char* kVolumeMin = "volume_min";
-constexpr const char* kVolumeMax = "volume_max";
-
-/// The frame of a file's transform; throws unless that is a rotation, translation and uniform
-/// scale.
-VoxelFrame frameOf(const openvdb::math::Transform& transform, float voxel_m,
-                   const std::string& path) {
-  require(transform.isLinear(), "readSceneVdb: ", path, ": expected a linear transform");
-  const openvdb::Mat4d m = transform.baseMap()->getAffineMap()->getMat4();
-  Matrix3d rotation;
-  Vector3d centre;
-  for (int row = 0; row < 3; ++row) {
-    for (int col = 0; col < 3; ++col) rotation(col, row) = m[row][col] / double(voxel_m);
-    centre[row] = m[3][row];
-  }
-  const double error = (rotation.transpose() * rotation - Matrix3d::Identity()).norm();
-  require(error < 1e-4 && rotation.determinant() > 0 && centre.allFinite(), "readSceneVdb: ", path,
-          ": expected a rotation with voxels of ", voxel_m, " m, found another transform");
-  VoxelFrame frame;
-  frame.voxel_m = voxel_m;
-  frame.world_from_grid.linear() = rotation;
-  frame.world_from_grid.translation() =
-      centre - rotation * Vector3d::Constant(0.5 * double(voxel_m));
-  return frame;
-}
 
 /// Exact signed distance (world units, negative inside) to the boundary of the union of the active
 /// voxels of `solid`, in a band of kBandVoxels at both sides. Squared distances to boxes add up
@@ -147,21 +119,6 @@ typename GridType::Ptr voxelGrid(const std::vector<Coord>& ijk, const Value& val
   return grid;
 }
 
-BoolGrid::Ptr emptyGrid(const TokenMask& empty) {
-  auto grid = BoolGrid::create();
-  auto accessor = grid->getUnsafeAccessor();
-  for (auto value = empty.cbeginValueOn(); value; ++value) {
-    CoordBBox box;
-    value.getBoundingBox(box);
-    if (value.isVoxelValue())
-      accessor.setValueOn(box.min(), true);
-    else
-      grid->tree().sparseFill(box, true, true);
-  }
-  grid->tree().prune();
-  return grid;
-}
-
 void requireWritable(const SceneVoxels& v, const std::string& path) {
   const size_t n = v.ijk.size();
   require(v.colour_linear.size() == n && v.density.size() == n && v.observed.size() == n &&
@@ -176,60 +133,6 @@ void requireWritable(const SceneVoxels& v, const std::string& path) {
                 std::isfinite(v.probability[i]),
             "writeSceneVdb: ", path, ": voxel ", v.ijk[i], " has a value that is not finite");
   }
-}
-
-/// Writes to any stream; OpenVDB's File does not look whether everything arrived on the disk.
-class SeekableArchive : public openvdb::io::Archive {
- public:
-  void writeTo(std::ostream& out, const openvdb::GridPtrVec& grids,
-               const openvdb::MetaMap& metadata) const {
-    openvdb::io::Archive::write(out, grids, /*seekable=*/true, metadata);
-  }
-};
-
-/// All grids and the metadata of a file. A file that ends too early or does not make sense throws.
-openvdb::GridPtrVec readGrids(const std::string& path, openvdb::MetaMap* metadata) {
-  constexpr uint64_t kMaxBytes = uint64_t(1) << 32;
-  const std::vector<uint8_t> bytes = readFile("readSceneVdb", path, kMaxBytes);
-  // OpenVDB trusts the sizes inside a file: flipped bits make it write outside its buffers. Files
-  // that another program wrote again have no checksum.
-  require(checksumMatches(bytes), "readSceneVdb: ", path,
-          ": corrupt (its checksum does not match)");
-  try {
-    // OpenVDB does not look whether a read succeeded; a stream that throws at its end does.
-    std::istringstream in(std::string(bytes.begin(), bytes.end()));
-    in.exceptions(std::ios::failbit | std::ios::badbit | std::ios::eofbit);
-    openvdb::io::Stream stream(in, /*delayLoad=*/false);
-    *metadata = *stream.getMetadata();
-    return *stream.getGrids();
-  } catch (const std::exception& e) {
-    throw Error(
-        joinText("readSceneVdb: ", path,
-                 ": expected a complete OpenVDB file, found one that is cut off, corrupt or "
-                 "of another kind (",
-                 e.what(), ")"));
-  }
-}
-
-template <typename GridType>
-typename GridType::Ptr findGrid(const openvdb::GridPtrVec& grids, const char* name,
-                                const std::string& path) {
-  for (const auto& grid : grids)
-    if (grid && grid->getName() == name) {
-      require(grid->isType<GridType>(), "readSceneVdb: ", path, ": expected grid '", name,
-              "' of type ", GridType::gridType(), ", found ", grid->type());
-      return openvdb::gridPtrCast<GridType>(grid);
-    }
-  throw Error(joinText("readSceneVdb: ", path, ": no grid '", name, "'"));
-}
-
-template <typename Value>
-Value findMetadata(const openvdb::MetaMap& metadata, const char* name, const std::string& path) {
-  using Meta = openvdb::TypedMetadata<Value>;
-  const auto found = metadata.getMetadata<Meta>(name);
-  require(bool(found), "readSceneVdb: ", path, ": no metadata '", name, "' of type ",
-          Meta::staticTypeName());
-  return found->value();
 }
 
 }  // namespace
@@ -277,9 +180,9 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
       {kGenerated, voxelGrid<BoolGrid>(v.ijk, [&](size_t i) { return v.observed[i] == 0; })},
       {kProbability, voxelGrid<FloatGrid>(v.ijk, [&](size_t i) { return v.probability[i]; })},
       {kBfsLevel, voxelGrid<FloatGrid>(v.ijk, [&](size_t i) { return v.bfs_level[i]; })},
-      {kSeenEmpty, emptyGrid(v.empty)},
+      {kSeenEmpty, gridOfMask(v.empty)},
   };
-  openvdb::GridPtrVec grids;
+  openvdb::GridCPtrVec grids;
   const auto transform = fileTransform(v.frame);
   for (const auto& [name, grid] : named) {
     grid->setName(name);
@@ -290,49 +193,30 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
   const auto observed =
       std::count_if(v.observed.begin(), v.observed.end(), [](uint8_t value) { return value != 0; });
   openvdb::MetaMap metadata;
-  const CoordBBox& bounds = v.frame.bounds;
   metadata.insertMeta("creator", openvdb::StringMetadata("vdb_complete"));
-  metadata.insertMeta(kVoxelM, openvdb::FloatMetadata(v.frame.voxel_m));
-  metadata.insertMeta(kVolumeMin, openvdb::Vec3IMetadata(bounds.min().asVec3i()));
-  metadata.insertMeta(kVolumeMax, openvdb::Vec3IMetadata(bounds.max().asVec3i()));
+  insertVolume(v.frame, &metadata);
   metadata.insertMeta("observed_count", openvdb::Int64Metadata(int64_t(observed)));
   metadata.insertMeta("generated_count", openvdb::Int64Metadata(int64_t(v.ijk.size()) - observed));
 
-  std::ostringstream archive;
-  SeekableArchive().writeTo(archive, grids, metadata);
-  std::string bytes = archive.str();
-  bytes += checksumTrailer(bytes.data(), bytes.size());
-
-  writeFile("writeSceneVdb", path, bytes.data(), bytes.size());
+  writeVdb("writeSceneVdb", path, grids, metadata);
 }
 
 SceneVoxels readSceneVdb(const std::string& path) {
-  openvdb::initialize();
-  openvdb::MetaMap metadata;
-  const openvdb::GridPtrVec grids = readGrids(path, &metadata);
-  const auto density = findGrid<FloatGrid>(grids, kDensity, path);
-  const auto colour = findGrid<Vec3SGrid>(grids, kColour, path);
-  const auto observed = findGrid<BoolGrid>(grids, kObserved, path);
-  const auto probability = findGrid<FloatGrid>(grids, kProbability, path);
-  const auto bfs_level = findGrid<FloatGrid>(grids, kBfsLevel, path);
-  const auto empty = findGrid<BoolGrid>(grids, kSeenEmpty, path);
+  constexpr const char* kOperation = "readSceneVdb";
+  constexpr uint64_t kMaxBytes = uint64_t(1) << 32;
+  const auto [grids, metadata] = readVdb(kOperation, path, kMaxBytes);
+  const auto density = findGrid<FloatGrid>(kOperation, grids, kDensity, path);
+  const auto colour = findGrid<Vec3SGrid>(kOperation, grids, kColour, path);
+  const auto observed = findGrid<BoolGrid>(kOperation, grids, kObserved, path);
+  const auto probability = findGrid<FloatGrid>(kOperation, grids, kProbability, path);
+  const auto bfs_level = findGrid<FloatGrid>(kOperation, grids, kBfsLevel, path);
+  const auto empty = findGrid<BoolGrid>(kOperation, grids, kSeenEmpty, path);
   for (const openvdb::GridBase::Ptr& grid : grids)
     require(grid->transform() == density->transform(), "readSceneVdb: ", path, ": grid '",
             grid->getName(), "' has another transform than 'density'");
 
-  const auto voxel_m = findMetadata<float>(metadata, kVoxelM, path);
-  require(std::isfinite(voxel_m) && voxel_m > 0, "readSceneVdb: ", path,
-          ": expected a positive voxel size, found ", voxel_m);
   SceneVoxels voxels;
-  voxels.frame = frameOf(density->transform(), voxel_m, path);
-  const Coord low(findMetadata<openvdb::Vec3i>(metadata, kVolumeMin, path));
-  const Coord high(findMetadata<openvdb::Vec3i>(metadata, kVolumeMax, path));
-  for (int axis = 0; axis < 3; ++axis)
-    require(std::abs(int64_t(low[axis])) <= kMaxVolumeIndex && int64_t(low[axis]) <= high[axis] &&
-                int64_t(high[axis]) - low[axis] < kMaxVolumeSide,
-            "readSceneVdb: ", path, ": expected a volume of 1 to ", kMaxVolumeSide,
-            " voxels a side, found ", low, " to ", high);
-  voxels.frame.bounds = CoordBBox(low, high);
+  voxels.frame = readVolume(kOperation, metadata, density->transform(), 0, path);
 
   // A few bytes can claim a tile of 4,096^3 voxels: count before taking memory.
   constexpr uint64_t kMaxVoxels = uint64_t(1) << 27;
@@ -366,13 +250,7 @@ SceneVoxels readSceneVdb(const std::string& path) {
     voxels.probability.push_back(p);
     voxels.bfs_level.push_back(int32_t(level));
   }
-  for (auto value = empty->cbeginValueOn(); value; ++value) {
-    CoordBBox box;
-    value.getBoundingBox(box);
-    require(voxels.frame.bounds.isInside(box), "readSceneVdb: ", path, ": empty voxels ", box,
-            " lie outside the volume ", voxels.frame.bounds);
-    voxels.empty.sparseFill(box, true, true);
-  }
+  voxels.empty.root() = maskOfGrid(kOperation, *empty, voxels.frame.bounds, path).root();
   return voxels;
 }
 

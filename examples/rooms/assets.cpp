@@ -3,7 +3,6 @@
 #include <jpeglib.h>
 #include <png.h>
 #include <tiny_obj_loader.h>
-#include <zip.h>
 
 #include <algorithm>
 #include <array>
@@ -23,6 +22,7 @@
 #include <unordered_map>
 
 #include "splat/image.h"
+#include "splat/zip_file.h"
 #include "vdb/error.h"
 #include "vdb/file_io.h"
 
@@ -76,29 +76,12 @@ std::string baseName(const std::string& path) { return path.substr(path.find_las
 
 // ---- zip files
 
-/// A zip file open for reading; entries may be read from several threads.
-class ZipFile {
+/// A zip file whose entries refer to each other by name.
+class CatalogueZip : public ZipFile {
  public:
-  explicit ZipFile(const std::string& path) : path_(path) {
-    int code = 0;
-    zip_.reset(zip_open(path.c_str(), ZIP_RDONLY, &code));
-    if (!zip_) {
-      zip_error_t error;
-      zip_error_init_with_code(&error, code);
-      const std::string reason = zip_error_strerror(&error);
-      zip_error_fini(&error);
-      throw Error(joinText("openAssets: ", path, ": expected a zip file, found: ", reason));
-    }
-    const zip_int64_t count = zip_get_num_entries(zip_.get(), 0);
-    for (zip_int64_t i = 0; i < count; ++i)
-      if (const char* name = zip_get_name(zip_.get(), zip_uint64_t(i), 0))
-        index_.emplace(name, zip_uint64_t(i));
-    for (const auto& [name, i] : index_) by_base_[lowerCase(baseName(name))].push_back(name);
+  explicit CatalogueZip(const std::string& path) : ZipFile("readAsset", path) {
+    for (const auto& [name, i] : entries()) by_base_[lowerCase(baseName(name))].push_back(name);
   }
-
-  const std::string& path() const { return path_; }
-  const std::map<std::string, zip_uint64_t>& entries() const { return index_; }
-  bool has(const std::string& name) const { return index_.count(name) > 0; }
 
   /// Name of the entry `file` refers to, seen from `folder` ("" or ending in a slash): its path;
   /// else its base name, in any case, in the folder; else the only entry of that base name. "" if
@@ -114,38 +97,10 @@ class ZipFile {
     return found->second.size() == 1 ? found->second[0] : "";
   }
 
-  std::string read(const std::string& name) const {
-    const auto entry = index_.find(name);
-    require(entry != index_.end(), "readAsset: ", path_, ": no entry ", name);
-    const std::lock_guard<std::mutex> lock(mutex_);
-    zip_stat_t stat;
-    const bool has_size = zip_stat_index(zip_.get(), entry->second, 0, &stat) == 0 &&
-                          (stat.valid & ZIP_STAT_SIZE) != 0;
-    require(has_size, "readAsset: ", path_, ": ", name, ": no size");
-    require(stat.size <= kMaxEntryBytes, "readAsset: ", path_, ": ", name,
-            ": entry is too large (expected at most ", kMaxEntryBytes, " bytes, found ", stat.size,
-            ")");
-    const std::unique_ptr<zip_file_t, int (*)(zip_file_t*)> file(
-        zip_fopen_index(zip_.get(), entry->second, 0), zip_fclose);
-    require(bool(file), "readAsset: ", path_, ": ", name, ": ", zip_strerror(zip_.get()));
-    std::string bytes(stat.size, '\0');
-    const zip_int64_t got = zip_fread(file.get(), bytes.data(), stat.size);
-    char more = 0;  // only reading up to the end checks the checksum
-    require(got == zip_int64_t(stat.size) && zip_fread(file.get(), &more, 1) == 0,
-            "readAsset: ", path_, ": ", name, ": corrupt entry (expected ", stat.size,
-            " bytes, found ", got, ")");
-    return bytes;
-  }
+  std::string read(const std::string& name) const { return ZipFile::read(name, kMaxEntryBytes); }
 
  private:
-  struct Discard {
-    void operator()(zip_t* zip) const { zip_discard(zip); }
-  };
-  std::string path_;
-  std::unique_ptr<zip_t, Discard> zip_;
-  std::map<std::string, zip_uint64_t> index_;
   std::unordered_map<std::string, std::vector<std::string>> by_base_;
-  mutable std::mutex mutex_;  // libzip archives are not for several threads
 };
 
 // ---- Java properties files: Latin-1, with escapes
@@ -311,12 +266,12 @@ std::vector<std::string> entryNumbers(const Properties& properties, const std::s
 // ---- Catalogues
 
 struct ModelSource {
-  const ZipFile* zip = nullptr;
+  const CatalogueZip* zip = nullptr;
   std::string obj;                           // name of the entry
   Matrix3d rotation = Matrix3d::Identity();  // in OBJ space, before all else
 };
 struct TextureSource {
-  const ZipFile* zip = nullptr;
+  const CatalogueZip* zip = nullptr;
   std::string image;
 };
 
@@ -516,7 +471,7 @@ Texture halved(const Texture& t) {
   return half;
 }
 
-Texture readTexture(const ZipFile& zip, const std::string& entry) {
+Texture readTexture(const CatalogueZip& zip, const std::string& entry) {
   const std::string bytes = zip.read(entry), where = zip.path() + ": " + entry;
   const bool is_png = bytes.compare(0, 4, "\x89PNG") == 0,
              is_jpeg = bytes.compare(0, 2, "\xFF\xD8") == 0;
@@ -591,7 +546,7 @@ std::string namedColoursMtl() {
 /// without a file is given the line "mtllib", whose empty name nothing has.
 class CatalogueMaterials : public tinyobj::MaterialReader {
  public:
-  CatalogueMaterials(const ZipFile& zip, std::string obj) : zip_(zip), obj_(std::move(obj)) {}
+  CatalogueMaterials(const CatalogueZip& zip, std::string obj) : zip_(zip), obj_(std::move(obj)) {}
 
   bool operator()(const std::string& name, std::vector<tinyobj::material_t>* materials,
                   std::map<std::string, int>* ids, std::string* warn, std::string* error) override {
@@ -609,7 +564,7 @@ class CatalogueMaterials : public tinyobj::MaterialReader {
   }
 
  private:
-  const ZipFile& zip_;
+  const CatalogueZip& zip_;
   std::string obj_;
 };
 
@@ -788,7 +743,7 @@ void addFace(ObjFile* obj, const tinyobj::index_t* indices, int count) {
   }
 }
 
-ObjFile readObj(const ZipFile& zip, const std::string& entry) {
+ObjFile readObj(const CatalogueZip& zip, const std::string& entry) {
   std::string text = zip.read(entry);
   if (text.find("mtllib") == std::string::npos) text = "mtllib named\n" + text;
   std::istringstream in(text);
@@ -959,8 +914,8 @@ Material finished(Material m, Finish finish) {
 // ---- The library
 
 struct AssetLibrary::Impl {
-  std::vector<std::unique_ptr<ZipFile>> zips;
-  const ZipFile* jar = nullptr;
+  std::vector<std::unique_ptr<CatalogueZip>> zips;
+  const CatalogueZip* jar = nullptr;
   std::vector<ModelInfo> models;
   std::vector<ModelSource> sources;
   std::map<std::string, size_t> by_id;
@@ -969,14 +924,14 @@ struct AssetLibrary::Impl {
 
   std::mutex mutex;  // of what is kept
   std::map<size_t, std::shared_ptr<const ReadMesh>> meshes;
-  std::map<std::pair<const ZipFile*, std::string>, std::shared_ptr<const Texture>> images;
+  std::map<std::pair<const CatalogueZip*, std::string>, std::shared_ptr<const Texture>> images;
 
-  void addModels(const ZipFile& zip, const std::string& properties_name,
+  void addModels(const CatalogueZip& zip, const std::string& properties_name,
                  const std::string& catalogue);
-  void addTextures(const ZipFile& zip, const std::string& properties_name);
+  void addTextures(const CatalogueZip& zip, const std::string& properties_name);
   void applyTable(const Table& table);
 
-  std::shared_ptr<const Texture> image(const ZipFile& zip, const std::string& entry);
+  std::shared_ptr<const Texture> image(const CatalogueZip& zip, const std::string& entry);
   std::shared_ptr<const Texture> textureOf(const ModelSource& source, const tinyobj::material_t& m,
                                            std::string* note);
   Material readMaterial(const tinyobj::material_t& m, size_t model, bool has_uv, std::string* note);
@@ -984,7 +939,7 @@ struct AssetLibrary::Impl {
   std::shared_ptr<const ReadMesh> readMesh(size_t model);
 };
 
-void AssetLibrary::Impl::addModels(const ZipFile& zip, const std::string& properties_name,
+void AssetLibrary::Impl::addModels(const CatalogueZip& zip, const std::string& properties_name,
                                    const std::string& catalogue) {
   const std::string where = zip.path() + ": " + properties_name;
   const Properties properties = parseProperties(zip.read(properties_name), where);
@@ -998,7 +953,7 @@ void AssetLibrary::Impl::addModels(const ZipFile& zip, const std::string& proper
   }
 }
 
-void AssetLibrary::Impl::addTextures(const ZipFile& zip, const std::string& properties_name) {
+void AssetLibrary::Impl::addTextures(const CatalogueZip& zip, const std::string& properties_name) {
   const std::string where = zip.path() + ": " + properties_name;
   const Properties properties = parseProperties(zip.read(properties_name), where);
   for (const std::string& number : entryNumbers(properties, "image")) {
@@ -1023,9 +978,9 @@ void AssetLibrary::Impl::applyTable(const Table& table) {
   }
 }
 
-std::shared_ptr<const Texture> AssetLibrary::Impl::image(const ZipFile& zip,
+std::shared_ptr<const Texture> AssetLibrary::Impl::image(const CatalogueZip& zip,
                                                          const std::string& entry) {
-  const std::pair<const ZipFile*, std::string> key(&zip, entry);
+  const std::pair<const CatalogueZip*, std::string> key(&zip, entry);
   {
     const std::lock_guard<std::mutex> lock(mutex);
     const auto found = images.find(key);
@@ -1153,8 +1108,8 @@ AssetLibrary AssetLibrary::open(const std::vector<std::string>& folders) {
           ", found none: install Debian's sweethome3d and sweethome3d-furniture");
   auto impl = std::make_unique<Impl>();
   for (const auto& [name, path] : files) {
-    impl->zips.push_back(std::make_unique<ZipFile>(path.string()));
-    const ZipFile& zip = *impl->zips.back();
+    impl->zips.push_back(std::make_unique<CatalogueZip>(path.string()));
+    const CatalogueZip& zip = *impl->zips.back();
     if (path.extension() == ".sh3f") {
       impl->addModels(zip, "PluginFurnitureCatalog.properties", path.stem().string());
       continue;

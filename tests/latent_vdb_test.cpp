@@ -1,0 +1,333 @@
+// Laws of the latent file: what is written is what is read, z in half precision; no damaged or
+// foreign file gets through; other programs open it.
+#include "vdb/latent_vdb.h"
+
+#include <gtest/gtest.h>
+#include <openvdb/io/File.h>
+#include <openvdb/openvdb.h>
+#include <openvdb/points/PointDataGrid.h>
+
+#include <cstring>
+#include <map>
+#include <random>
+#include <set>
+
+#include "tests/files.h"
+#include "vdb/grid_instances.h"
+
+namespace vdbc {
+namespace {
+
+namespace fs = std::filesystem;
+using PointGrid = openvdb::points::PointDataGrid;
+
+/// A shuffled half of the nodes of a turned volume, observed and generated, with what was seen.
+LatentFile someLatents(int level = 1, int side = 24, int dim = 32) {
+  LatentFile file;
+  file.encoder_hash = "0123456789abcdef";
+  LatentGrid& g = file.latents;
+  g.level = level, g.dim = dim;
+  g.frame.voxel_m = 0.07f;
+  g.frame.world_from_grid.linear() =
+      Eigen::AngleAxisd(0.5, Eigen::Vector3d(0.1, -0.2, 1).normalized()).toRotationMatrix();
+  g.frame.world_from_grid.translation() = Eigen::Vector3d(3.1, 0, 1e-17);
+  g.frame.bounds = CoordBBox(Coord(-8), Coord(side - 9));
+  std::mt19937 random(5);
+  std::normal_distribution<float> normal;
+  const CoordBBox nodes(tokenCoord(g.frame.bounds.min(), level),
+                        tokenCoord(g.frame.bounds.max(), level));
+  for (const Coord& ijk : nodes)
+    if (random() % 2) g.ijk.push_back(ijk);
+  std::shuffle(g.ijk.begin(), g.ijk.end(), random);
+  for (size_t i = 0; i < g.ijk.size(); ++i) {
+    const bool observed = random() % 3 > 0;
+    g.observed.push_back(observed);
+    g.probability.push_back(observed ? 1.f : .1f + .8f * float(random() % 1000) / 1000);
+    g.bfs_level.push_back(observed ? 0 : 1 + int(random() % 9));
+    for (int c = 0; c < dim; ++c) g.z.push_back(normal(random) * (c % 3 ? 1.f : 1e-5f));
+  }
+  for (const Coord& ijk : g.frame.bounds) {
+    const unsigned kind = random() % 8;
+    if (kind == 0) file.seen.filled.setValueOn(ijk);
+    if (kind == 1 || ijk.x() < 0) file.seen.empty.setValueOn(ijk);
+  }
+  file.seen.empty.prune();
+  return file;
+}
+
+std::vector<float> inHalf(std::vector<float> values) {
+  for (float& v : values) v = float(openvdb::math::half(v));
+  return values;
+}
+
+std::set<Coord> setOf(const TokenMask& mask) {
+  const std::vector<Coord> coords = activeCoords(mask);
+  return {coords.begin(), coords.end()};
+}
+
+/// All of it equal bit for bit, but for z, which is `z`.
+void expectSame(const LatentFile& a, const LatentFile& b, const std::vector<float>& z) {
+  const LatentGrid &g = a.latents, &h = b.latents;
+  EXPECT_EQ(a.encoder_hash, b.encoder_hash);
+  EXPECT_EQ(g.level, h.level);
+  EXPECT_EQ(g.dim, h.dim);
+  EXPECT_EQ(g.ijk, h.ijk);
+  ASSERT_EQ(g.z.size(), z.size());
+  EXPECT_TRUE(z.empty() || std::memcmp(g.z.data(), z.data(), z.size() * sizeof(float)) == 0);
+  EXPECT_EQ(g.observed, h.observed);
+  EXPECT_EQ(g.probability, h.probability);
+  EXPECT_EQ(g.bfs_level, h.bfs_level);
+  EXPECT_EQ(g.frame.voxel_m, h.frame.voxel_m);
+  EXPECT_EQ(g.frame.bounds, h.frame.bounds);
+  EXPECT_EQ(g.frame.world_from_grid.matrix(), h.frame.world_from_grid.matrix());
+  EXPECT_EQ(setOf(a.seen.filled), setOf(b.seen.filled));
+  EXPECT_EQ(setOf(a.seen.empty), setOf(b.seen.empty));
+}
+
+TEST(LatentVdb, RoundTripIsExactInHalfPrecision) {
+  const TemporaryFolder folder;
+  for (int level : {0, 1, 2}) {
+    const LatentFile before = someLatents(level);
+    ASSERT_GT(before.latents.size(), 50);
+    const std::vector<float> halves = inHalf(before.latents.z);
+    EXPECT_NE(before.latents.z, halves);
+    writeLatentVdb(before, folder / "a.vdb");
+    const LatentFile after = readLatentVdb(folder / "a.vdb");
+    expectSame(after, before, halves);
+    writeLatentVdb(after, folder / "b.vdb");
+    expectSame(readLatentVdb(folder / "b.vdb"), after, halves);
+  }
+  EXPECT_EQ(std::distance(fs::directory_iterator(folder.path), fs::directory_iterator()), 2);
+}
+
+TEST(LatentVdb, LatentsThatAreEqualEverywhereRoundTrip) {  // OpenVDB stores them as one value
+  const TemporaryFolder folder;
+  LatentFile before = someLatents();
+  std::fill(before.latents.z.begin(), before.latents.z.end(), .5f);
+  std::fill(before.latents.probability.begin(), before.latents.probability.end(), 1.f);
+  writeLatentVdb(before, folder / "a.vdb");
+  expectSame(readLatentVdb(folder / "a.vdb"), before, before.latents.z);
+}
+
+TEST(LatentVdb, NoLatentsRoundTrip) {
+  const TemporaryFolder folder;
+  LatentFile before;
+  before.latents.dim = 8;
+  before.latents.frame.bounds = CoordBBox(Coord(0), Coord(3));
+  writeLatentVdb(before, folder / "a.vdb");
+  expectSame(readLatentVdb(folder / "a.vdb"), before, {});
+}
+
+TEST(LatentVdb, OnePointAtEachNodesCentre) {
+  const TemporaryFolder folder;
+  const LatentFile file = someLatents();
+  writeLatentVdb(file, folder / "a.vdb");
+  openvdb::io::File in(folder / "a.vdb");
+  in.open(false);
+  const auto grid = openvdb::gridPtrCast<PointGrid>(in.readGrid("latent"));
+  std::set<Coord> expected(file.latents.ijk.begin(), file.latents.ijk.end()), found;
+  for (auto leaf = grid->tree().cbeginLeaf(); leaf; ++leaf) {
+    const openvdb::points::AttributeHandle<openvdb::Vec3f> p(leaf->constAttributeArray("P"));
+    EXPECT_EQ(leaf->constAttributeArray("z").stride(), 32u);
+    EXPECT_EQ(leaf->constAttributeArray("z").codecType(), "trnc");
+    for (auto point = leaf->beginIndexOn(); point; ++point) {
+      const Coord ijk = point.getCoord();
+      found.insert(ijk);
+      const openvdb::Vec3d world = grid->transform().indexToWorld(
+          ijk.asVec3d() + openvdb::Vec3d(p.get(*point)));
+      const Eigen::Vector3d centre = file.latents.frame.toWorld(
+          2 * Eigen::Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5));
+      ASSERT_LT((Eigen::Vector3d(world.x(), world.y(), world.z()) - centre).norm(), 1e-9);
+    }
+  }
+  EXPECT_EQ(found, expected);
+  EXPECT_EQ(grid->metaValue<int64_t>("point_count"), file.latents.size());
+}
+
+constexpr size_t kTrailerBytes = 16;
+
+TEST(LatentVdb, EveryTruncationThrows) {
+  const TemporaryFolder folder;
+  writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");
+  const std::string bytes = bytesOf(folder / "a.vdb");
+  ASSERT_GT(bytes.size(), 1000u);
+  const size_t grids = bytes.size() - kTrailerBytes;
+  for (size_t n = 0; n < grids; n += n < 300 || n + 8 > grids ? 1 : 53) {
+    writeBytes(folder / "cut.vdb", bytes.substr(0, n));
+    EXPECT_THROW(readLatentVdb(folder / "cut.vdb"), Error) << n << " of " << bytes.size();
+  }
+}
+
+TEST(LatentVdb, EveryCorruptionThrows) {
+  const TemporaryFolder folder;
+  writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");
+  const std::string bytes = bytesOf(folder / "a.vdb");
+  std::mt19937 random(4);
+  for (int i = 0; i < 300; ++i) {
+    std::string bad = bytes;
+    const size_t at = random() % (bad.size() - kTrailerBytes);
+    bad[at] = char(bad[at] ^ (1 << i % 8));
+    writeBytes(folder / "bad.vdb", bad);
+    EXPECT_THROW(readLatentVdb(folder / "bad.vdb"), Error) << "byte " << at;
+  }
+}
+
+using Grids = std::map<std::string, openvdb::GridBase::Ptr>;
+
+/// The file as another program would write it again after `change`.
+template <typename Change>
+void rewrite(const std::string& from, const std::string& to, Change change) {
+  openvdb::io::File file(from);
+  file.open(false);
+  openvdb::MetaMap metadata = *file.getMetadata();
+  Grids by_name;
+  for (const auto& grid : *file.getGrids()) by_name[grid->getName()] = grid;
+  change(by_name, metadata);
+  openvdb::GridPtrVec changed;
+  for (const auto& [name, grid] : by_name) changed.push_back(grid);
+  openvdb::io::File(to).write(changed, metadata);
+}
+
+TEST(LatentVdb, FilesWrittenAgainByOthersAreRead) {
+  const TemporaryFolder folder;
+  const LatentFile before = someLatents();
+  writeLatentVdb(before, folder / "a.vdb");
+  rewrite(folder / "a.vdb", folder / "b.vdb", [](Grids&, openvdb::MetaMap&) {});
+  expectSame(readLatentVdb(folder / "b.vdb"), before, inHalf(before.latents.z));
+}
+
+TEST(LatentVdb, ForeignFilesWithNonsenseThrow) {
+  using openvdb::MetaMap;
+  const TemporaryFolder folder;
+  writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");
+  const auto rejects = [&](const char* named, auto change) {
+    rewrite(folder / "a.vdb", folder / "b.vdb", change);
+    try {
+      readLatentVdb(folder / "b.vdb");
+      ADD_FAILURE() << "was read: " << named;
+    } catch (const Error& e) {
+      const std::string text = e.what();
+      EXPECT_NE(text.find(named), std::string::npos) << text << " lacks " << named;
+      EXPECT_EQ(text.find('\n'), std::string::npos) << text;
+    }
+  };
+  const auto leafOf = [](Grids& g) {
+    return openvdb::gridPtrCast<PointGrid>(g["latent"])->tree().beginLeaf();
+  };
+  for (const char* name : {"latent", "filled", "empty"}) {
+    rejects(name, [&](Grids& g, MetaMap&) { g.erase(name); });
+    rejects("transform", [&](Grids& g, MetaMap&) {
+      g[name]->setTransform(g[name]->transform().copy());
+      g[name]->transform().postTranslate({1, 0, 0});
+    });
+  }
+  for (const char* name : {"encoder_hash", "latent_level", "latent_dim", "voxel_m", "volume_min",
+                           "world_from_grid"})
+    rejects(name, [&](Grids&, MetaMap& m) { m.removeMeta(name); });
+  rejects("dim", [](Grids&, MetaMap& m) {
+    m.insertMeta("latent_dim", openvdb::Int32Metadata(1 << 30));
+  });
+  rejects("expected z with 3", [](Grids&, MetaMap& m) {
+    m.insertMeta("latent_dim", openvdb::Int32Metadata(3));
+  });
+  rejects("level", [](Grids&, MetaMap& m) {
+    m.insertMeta("latent_level", openvdb::Int32Metadata(40));
+  });
+  rejects("transform", [](Grids&, MetaMap& m) {
+    m.insertMeta("latent_level", openvdb::Int32Metadata(2));
+  });
+  rejects("outside the volume", [](Grids&, MetaMap& m) {
+    m.insertMeta("volume_max", openvdb::Vec3IMetadata({-7, -7, -7}));
+  });
+  rejects("outside the volume", [](Grids& g, MetaMap&) {
+    openvdb::gridPtrCast<BoolGrid>(g["filled"])->tree().setValueOn(Coord(99, 0, 0), true);
+  });
+  for (const float bad : {INFINITY, NAN})
+    rejects("makes no sense", [&](Grids& g, MetaMap&) {
+      openvdb::points::AttributeWriteHandle<float>(leafOf(g)->attributeArray("z")).set(0, 1, bad);
+    });
+  rejects("makes no sense", [&](Grids& g, MetaMap&) {
+    openvdb::points::AttributeWriteHandle<float>(leafOf(g)->attributeArray("probability"))
+        .set(0, 1.5f);
+  });
+  for (const int row : {-1, 1, 1 << 30})
+    rejects("row", [&](Grids& g, MetaMap&) {
+      openvdb::points::AttributeWriteHandle<int32_t> rows(leafOf(g)->attributeArray("row"));
+      rows.set(rows.get(0) == 1, row);
+    });
+  rejects("one point a node", [&](Grids& g, MetaMap&) {  // all points in the last voxel
+    auto leaf = leafOf(g);
+    const auto points = leaf->getLastValue();
+    std::vector<openvdb::PointDataIndex32> offsets(512, 0);
+    offsets.back() = points;
+    leaf->setOffsets(offsets);
+  });
+  writeBytes(folder / "b.vdb", "not a volume at all, but some words of text\n");
+  EXPECT_THROW(readLatentVdb(folder / "b.vdb"), Error);
+  EXPECT_THROW(readLatentVdb(folder / "missing.vdb"), Error);
+  EXPECT_THROW(readLatentVdb(folder.path.string()), Error);
+}
+
+TEST(LatentVdb, BadLatentsThrowAndLeaveNothing) {
+  const TemporaryFolder folder;
+  const auto rejects = [&](auto change) {
+    LatentFile file = someLatents(1, 8, 4);
+    change(file.latents);
+    EXPECT_THROW(writeLatentVdb(file, folder / "a.vdb"), Error);
+  };
+  rejects([](LatentGrid& g) { g.z.pop_back(); });
+  rejects([](LatentGrid& g) { g.bfs_level.pop_back(); });
+  rejects([](LatentGrid& g) { g.ijk[0] = g.ijk[1]; });
+  rejects([](LatentGrid& g) { g.ijk[0] = Coord(1000, 0, 0); });
+  rejects([](LatentGrid& g) { g.z[3] = NAN; });
+  rejects([](LatentGrid& g) { g.z[3] = 1e6f; });
+  rejects([](LatentGrid& g) { g.probability[0] = 2; });
+  rejects([](LatentGrid& g) { g.frame.voxel_m = 0; });
+  rejects([](LatentGrid& g) { g.level = 3; });
+  EXPECT_THROW(writeLatentVdb(someLatents(), folder / "no/such/folder/a.vdb"), Error);
+  EXPECT_TRUE(fs::is_empty(folder.path));
+}
+
+TEST(LatentVdb, VdbPrintOpensIt) {
+  if (!installed("vdb_print")) GTEST_SKIP() << "vdb_print is not installed";
+  const TemporaryFolder folder;
+  writeLatentVdb(someLatents(), folder / "a.vdb");
+  const std::string text =
+      outputOf("vdb_print -l " + folder / "a.vdb") + outputOf("vdb_print -m " + folder / "a.vdb");
+  for (const char* part : {"latent", "ptdataidx32", "filled", "empty", "encoder_hash",
+                           "0123456789abcdef", "point_attributes", "latent_dim"})
+    EXPECT_NE(text.find(part), std::string::npos) << part << " in\n" << text;
+}
+
+TEST(LatentVdb, BlenderListsItsGrids) {
+  if (!installed("blender")) GTEST_SKIP() << "blender is not installed";
+  const TemporaryFolder folder;
+  writeLatentVdb(someLatents(), folder / "a.vdb");
+  writeBytes(folder / "look.py", R"(
+import bpy, sys
+bpy.ops.object.volume_import(filepath=sys.argv[-1])
+grids = bpy.context.object.data.grids
+grids.load()
+for grid in grids:
+    print('GRID', grid.name, grid.data_type, '.')
+)");
+  const std::string text =
+      outputOf("timeout 120 blender -b --factory-startup -noaudio --python-exit-code 1 -P " +
+               folder / "look.py" + " -- " + folder / "a.vdb");
+  for (const char* line : {"GRID latent POINTS .", "GRID filled BOOLEAN .", "GRID empty BOOLEAN ."})
+    EXPECT_NE(text.find(line), std::string::npos) << line << " in\n" << text;
+}
+
+TEST(LatentVdb, PythonReadsTheVoxelsSeen) {
+  if (outputOf("python3 -c 'import pyopenvdb; print(1)'").empty())
+    GTEST_SKIP() << "python3-openvdb is not installed";
+  const TemporaryFolder folder;
+  const LatentFile file = someLatents();
+  writeLatentVdb(file, folder / "a.vdb");
+  const std::string text = outputOf("python3 -c \"import pyopenvdb; print(pyopenvdb.read('" +
+                                    folder / "a.vdb" + "', 'filled').activeVoxelCount())\"");
+  EXPECT_EQ(text, std::to_string(setOf(file.seen.filled).size()) + "\n");
+}
+
+}  // namespace
+}  // namespace vdbc
