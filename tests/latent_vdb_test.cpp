@@ -180,8 +180,9 @@ void rewrite(const std::string& from, const std::string& to, Change change) {
   openvdb::io::File file(from);
   file.open(false);
   openvdb::MetaMap metadata = *file.getMetadata();
+  const openvdb::GridPtrVecPtr grids = file.getGrids();
   Grids by_name;
-  for (const auto& grid : *file.getGrids()) by_name[grid->getName()] = grid;
+  for (const auto& grid : *grids) by_name[grid->getName()] = grid;
   change(by_name, metadata);
   openvdb::GridPtrVec changed;
   for (const auto& [name, grid] : by_name) changed.push_back(grid);
