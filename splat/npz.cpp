@@ -64,7 +64,8 @@ std::optional<std::vector<int64_t>> parseShape(std::string_view text) {
 std::string_view headerOf(std::string_view start, size_t* begin) {
   if (start.size() < 12 || start.substr(0, 6) != "\x93NUMPY") return {};
   const bool short_form = start[6] == 1;  // versions 2 and 3 have four bytes of length
-  const size_t length = short_form ? load<uint16_t>(start.data() + 8) : load<uint32_t>(start.data() + 8);
+  const size_t length =
+      short_form ? load<uint16_t>(start.data() + 8) : load<uint32_t>(start.data() + 8);
   const size_t before = short_form ? 10 : 12;
   if (length > start.size() - before) return {};
   *begin = before + length;
@@ -100,7 +101,8 @@ std::optional<NpyArray> NpzFile::describe(const std::string& name) const {
   require(array.word > 0, where,
           "expected float16, float32, float64 or uint8, little-endian, found ",
           type.substr(0, type.find(',')));
-  require(order.substr(0, 5) == "False", where, "Fortran order is not supported (expected C order)");
+  require(order.substr(0, 5) == "False", where,
+          "Fortran order is not supported (expected C order)");
   const auto dims = parseShape(shape);
   require(bool(dims), where, "expected a shape of at most 8 numbers, found ",
           shape.substr(0, shape.find(')') + 1));

@@ -71,7 +71,8 @@ PointmapScale scaleOf(const Poses& extrinsic, const Poses& c2w, double given,
           ": expected a positive scale, found ", given);
   if (given > 0) return {given, "given"};
   if (extrinsic.empty()) return {1, "c2w"};
-  require(!c2w.empty(), kReadViews, ": ", path, ": pointmaps of unknown scale (expected metres per ",
+  require(!c2w.empty(), kReadViews, ": ", path,
+          ": pointmaps of unknown scale (expected metres per ",
           "unit, --scale, or metric poses `c2w` besides `extrinsic`)");
   const double metres = spread(c2w), units = spread(extrinsic);
   require(metres >= kMinBaselineM && units > 1e-9 && std::isfinite(metres / units), kReadViews,
@@ -154,8 +155,7 @@ Geometry describeGeometry(const NpzFile& npz, int64_t views) {
           ": expected 1 to 2^28 pixels, found ", g.width, " x ", g.height);
   for (const char* name : {g.depth ? "depth_conf" : "world_points_conf", "conf"})
     if (!g.confidence) g.confidence = npz.describe(name);
-  if (g.confidence)
-    requireShape(npz, *g.confidence, {views, g.height, g.width}, "(S, H, W)");
+  if (g.confidence) requireShape(npz, *g.confidence, {views, g.height, g.width}, "(S, H, W)");
   return g;
 }
 
@@ -208,8 +208,7 @@ std::vector<View> readPointmaps(const std::string& path, const ReadViewsSettings
   const auto scale = float(poses.scale.metres_per_unit);
   const auto count = int64_t(poses.world.size());
   Geometry g = describeGeometry(npz, count);
-  const std::vector<Camera> cameras =
-      camerasOf(npz, poses.world, int(g.width), int(g.height));
+  const std::vector<Camera> cameras = camerasOf(npz, poses.world, int(g.width), int(g.height));
   const std::vector<size_t> frames = selectFrames(settings, size_t(count), path);
   const auto viewOf = [&](size_t s) {
     View view;

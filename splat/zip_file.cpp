@@ -46,8 +46,8 @@ std::string ZipFile::readBytes(const std::string& name, uint64_t count, uint64_t
   require(entry != index_.end(), operation_, ": ", path_, ": no entry ", name);
   const std::lock_guard<std::mutex> lock(mutex_);
   zip_stat_t stat;
-  const bool has_size = zip_stat_index(zip_.get(), entry->second, 0, &stat) == 0 &&
-                        (stat.valid & ZIP_STAT_SIZE) != 0;
+  const bool has_size =
+      zip_stat_index(zip_.get(), entry->second, 0, &stat) == 0 && (stat.valid & ZIP_STAT_SIZE) != 0;
   require(has_size, operation_, ": ", path_, ": ", name, ": no size");
   *size = stat.size;
   require(!whole || stat.size <= count, operation_, ": ", path_, ": ", name,

@@ -133,10 +133,10 @@ TEST(LatentVdb, OnePointAtEachNodesCentre) {
     for (auto point = leaf->beginIndexOn(); point; ++point) {
       const Coord ijk = point.getCoord();
       found.insert(ijk);
-      const openvdb::Vec3d world = grid->transform().indexToWorld(
-          ijk.asVec3d() + openvdb::Vec3d(p.get(*point)));
-      const Eigen::Vector3d centre = file.latents.frame.toWorld(
-          2 * Eigen::Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5));
+      const openvdb::Vec3d world =
+          grid->transform().indexToWorld(ijk.asVec3d() + openvdb::Vec3d(p.get(*point)));
+      const Eigen::Vector3d centre =
+          file.latents.frame.toWorld(2 * Eigen::Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5));
       ASSERT_LT((Eigen::Vector3d(world.x(), world.y(), world.z()) - centre).norm(), 1e-9);
     }
   }
@@ -222,21 +222,17 @@ TEST(LatentVdb, ForeignFilesWithNonsenseThrow) {
       g[name]->transform().postTranslate({1, 0, 0});
     });
   }
-  for (const char* name : {"encoder_hash", "latent_level", "latent_dim", "voxel_m", "volume_min",
-                           "world_from_grid"})
+  for (const char* name :
+       {"encoder_hash", "latent_level", "latent_dim", "voxel_m", "volume_min", "world_from_grid"})
     rejects(name, [&](Grids&, MetaMap& m) { m.removeMeta(name); });
-  rejects("dim", [](Grids&, MetaMap& m) {
-    m.insertMeta("latent_dim", openvdb::Int32Metadata(1 << 30));
-  });
-  rejects("expected z with 3", [](Grids&, MetaMap& m) {
-    m.insertMeta("latent_dim", openvdb::Int32Metadata(3));
-  });
-  rejects("level", [](Grids&, MetaMap& m) {
-    m.insertMeta("latent_level", openvdb::Int32Metadata(40));
-  });
-  rejects("transform", [](Grids&, MetaMap& m) {
-    m.insertMeta("latent_level", openvdb::Int32Metadata(2));
-  });
+  rejects("dim",
+          [](Grids&, MetaMap& m) { m.insertMeta("latent_dim", openvdb::Int32Metadata(1 << 30)); });
+  rejects("expected z with 3",
+          [](Grids&, MetaMap& m) { m.insertMeta("latent_dim", openvdb::Int32Metadata(3)); });
+  rejects("level",
+          [](Grids&, MetaMap& m) { m.insertMeta("latent_level", openvdb::Int32Metadata(40)); });
+  rejects("transform",
+          [](Grids&, MetaMap& m) { m.insertMeta("latent_level", openvdb::Int32Metadata(2)); });
   rejects("outside the volume", [](Grids&, MetaMap& m) {
     m.insertMeta("volume_max", openvdb::Vec3IMetadata({-7, -7, -7}));
   });
@@ -273,18 +269,19 @@ TEST(LatentVdb, BadLatentsThrowAndLeaveNothing) {
   const TemporaryFolder folder;
   const auto rejects = [&](auto change) {
     LatentFile file = someLatents(1, 8, 4);
-    change(file.latents);
+    change(file);
     EXPECT_THROW(writeLatentVdb(file, folder / "a.vdb"), Error);
   };
-  rejects([](LatentGrid& g) { g.z.pop_back(); });
-  rejects([](LatentGrid& g) { g.bfs_level.pop_back(); });
-  rejects([](LatentGrid& g) { g.ijk[0] = g.ijk[1]; });
-  rejects([](LatentGrid& g) { g.ijk[0] = Coord(1000, 0, 0); });
-  rejects([](LatentGrid& g) { g.z[3] = NAN; });
-  rejects([](LatentGrid& g) { g.z[3] = 1e6f; });
-  rejects([](LatentGrid& g) { g.probability[0] = 2; });
-  rejects([](LatentGrid& g) { g.frame.voxel_m = 0; });
-  rejects([](LatentGrid& g) { g.level = 3; });
+  rejects([](LatentFile& f) { f.latents.z.pop_back(); });
+  rejects([](LatentFile& f) { f.latents.bfs_level.pop_back(); });
+  rejects([](LatentFile& f) { f.latents.ijk[0] = f.latents.ijk[1]; });
+  rejects([](LatentFile& f) { f.latents.ijk[0] = Coord(1000, 0, 0); });
+  rejects([](LatentFile& f) { f.latents.z[3] = NAN; });
+  rejects([](LatentFile& f) { f.latents.z[3] = 1e6f; });
+  rejects([](LatentFile& f) { f.latents.probability[0] = 2; });
+  rejects([](LatentFile& f) { f.latents.frame.voxel_m = 0; });
+  rejects([](LatentFile& f) { f.latents.level = 3; });
+  rejects([](LatentFile& f) { f.seen.filled.setValueOn(Coord(-9, 0, 0)); });
   EXPECT_THROW(writeLatentVdb(someLatents(), folder / "no/such/folder/a.vdb"), Error);
   EXPECT_TRUE(fs::is_empty(folder.path));
 }

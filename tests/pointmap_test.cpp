@@ -29,7 +29,8 @@ struct Member {
 
 std::string npyBytes(const std::string& descr, const std::string& shape, const std::string& values,
                      const char* order = "False") {
-  std::string header = "{'descr': " + descr + ", 'fortran_order': " + order + ", 'shape': " + shape + ", }";
+  std::string header =
+      "{'descr': " + descr + ", 'fortran_order': " + order + ", 'shape': " + shape + ", }";
   header.resize((10 + header.size() + 64) / 64 * 64 - 10, ' ');
   header.back() = '\n';
   const auto length = uint16_t(header.size());
@@ -150,8 +151,7 @@ Arrays arraysOf(const Scene& scene, double scale, const std::string& type = "<f4
       }
     for (int k = 0; k < 3; ++k)
       for (int y = 0; y < kHeight; ++y)
-        for (int x = 0; x < kWidth; ++x)
-          images.push_back(double(scene.colour[s].at(x, y, k)));
+        for (int x = 0; x < kWidth; ++x) images.push_back(double(scene.colour[s].at(x, y, k)));
   }
   const std::string exact = type == "<f8" ? type : "<f4";
   Arrays a;
@@ -194,7 +194,8 @@ TEST(Pointmap, AnalyticDepthComesBackByEveryKeyAndType) {
   for (const char* type : {"<f4", "<f8", "<f2", "|u1"})
     for (bool deflated : {false, true})
       for (bool points : {false, true}) {
-        SCOPED_TRACE(testing::Message() << type << " deflated " << deflated << " points " << points);
+        SCOPED_TRACE(testing::Message()
+                     << type << " deflated " << deflated << " points " << points);
         Arrays a = arraysOf(scene, 2.5, type);
         a.members.erase("c2w");
         a.members.erase(points ? "depth" : "world_points");
@@ -208,8 +209,8 @@ TEST(Pointmap, DepthMayLackItsLastDimension) {
   const Scene scene = ballInBox(1);
   Arrays a = arraysOf(scene, 1);
   a.members.erase("c2w");
-  a.members["depth"] = member("depth", {1, kHeight, kWidth},
-                              {scene.depth[0].begin(), scene.depth[0].end()});
+  a.members["depth"] =
+      member("depth", {1, kHeight, kWidth}, {scene.depth[0].begin(), scene.depth[0].end()});
   writeNpz(a.list(), folder / "a.npz");
   expectScene(readViews(folder / "a.npz", scaled(1)), scene, 1e-6);
 }
@@ -288,7 +289,8 @@ TEST(Pointmap, PointsThatMissTheirPixelAreInvalid) {
   for (int y = 0; y < kHeight; ++y)
     for (int x = 0; x < kWidth; ++x) {
       const double off = x % 2 ? .4 : .6;
-      Vector3d p = c.unproject(x + .5 + off, y + .5, double(scene.depth[0][size_t(y * kWidth + x)]));
+      Vector3d p =
+          c.unproject(x + .5 + off, y + .5, double(scene.depth[0][size_t(y * kWidth + x)]));
       if (y == 0) p.x() = NAN;
       points.insert(points.end(), {p.x(), p.y(), p.z()});
     }
@@ -315,8 +317,8 @@ TEST(Pointmap, ConfidenceBelowHalfOfItsMedianIsNoDepth) {
     EXPECT_EQ(views[1].depth[size_t(i)] > 0, i != 0) << i;
   }
   // What belongs to depth comes first; constant confidence drops nothing.
-  a.members["depth_conf"] = member("depth_conf", {2, kHeight, kWidth},
-                                   std::vector<double>(size_t(2 * pixels), 1.));
+  a.members["depth_conf"] =
+      member("depth_conf", {2, kHeight, kWidth}, std::vector<double>(size_t(2 * pixels), 1.));
   writeNpz(a.list(), folder / "a.npz");
   expectScene(readViews(folder / "a.npz"), scene, 1e-5);
 }
@@ -483,8 +485,8 @@ arrays['depth'] = np.asfortranarray(arrays['depth'])
 np.savez(sys.argv[2] + '/fortran.npz', **arrays)
 print('written')
 )");
-  const std::string text =
-      outputOf("python3 " + folder / "write.py" + " " + folder / "ours.npz" + " " + folder.path.string());
+  const std::string text = outputOf("python3 " + folder / "write.py" + " " + folder / "ours.npz" +
+                                    " " + folder.path.string());
   ASSERT_NE(text.find("written"), std::string::npos) << text;
   for (const char* name : {"stored.npz", "deflated.npz"})
     expectScene(readViews(folder / name, scaled(2.5)), scene, 1e-5);

@@ -48,7 +48,8 @@ void requireTokens(const char* operation, const LatentGrid& g, const std::string
   }
 }
 
-void requireWritable(const LatentGrid& g, const std::string& path) {
+void requireWritable(const LatentFile& file, const std::string& path) {
+  const LatentGrid& g = file.latents;
   const size_t n = g.ijk.size();
   require(g.level >= 0 && g.level < kTokenLevels && g.dim > 0 && g.dim <= kMaxDim &&
               std::isfinite(g.frame.voxel_m) && g.frame.voxel_m > 0,
@@ -60,6 +61,11 @@ void requireWritable(const LatentGrid& g, const std::string& path) {
   require(int64_t(n) * g.dim <= kMaxValues, kWrite, ": ", path, ": expected at most ", kMaxValues,
           " values, found ", n, " x ", g.dim);
   requireTokens(kWrite, g, path);
+  for (const TokenMask* mask : {&file.seen.filled, &file.seen.empty}) {
+    CoordBBox box;
+    require(!mask->evalActiveVoxelBoundingBox(box) || g.frame.bounds.isInside(box), kWrite, ": ",
+            path, ": voxels ", box, " lie outside the volume ", g.frame.bounds);
+  }
 }
 
 void fillLeaf(const LatentGrid& g, const std::vector<int64_t>& sorted, const LeafRows& range) {
@@ -122,8 +128,8 @@ openvdb::MetaMap metadataOf(const LatentFile& file) {
   for (int row = 0; row < 4; ++row)
     for (int col = 0; col < 4; ++col) frame[row][col] = g.frame.world_from_grid.matrix()(col, row);
   metadata.insertMeta(kFrame, openvdb::Mat4DMetadata(frame));
-  const auto observed = std::count_if(g.observed.begin(), g.observed.end(),
-                                      [](uint8_t value) { return value != 0; });
+  const auto observed =
+      std::count_if(g.observed.begin(), g.observed.end(), [](uint8_t value) { return value != 0; });
   metadata.insertMeta("observed_count", openvdb::Int64Metadata(int64_t(observed)));
   metadata.insertMeta("generated_count", openvdb::Int64Metadata(g.size() - observed));
   return metadata;
@@ -162,8 +168,8 @@ std::vector<const PointLeaf*> checkedLeaves(const PointGrid& grid, int dim, size
     }
     if (points == 0) continue;
     const auto stride = leaf->constAttributeArray(kZ).stride();
-    require(int64_t(stride) == dim, kRead, ": ", path, ": expected z with ", dim,
-            " values, found ", stride);
+    require(int64_t(stride) == dim, kRead, ": ", path, ": expected z with ", dim, " values, found ",
+            stride);
     *count += points;
     require(int64_t(*count) * dim <= kMaxValues, kRead, ": ", path, ": expected at most ",
             kMaxValues, " values, found more");
@@ -209,7 +215,7 @@ void readTokens(const PointGrid& grid, LatentGrid* g, const std::string& path) {
 }  // namespace
 
 void writeLatentVdb(const LatentFile& file, const std::string& path) {
-  requireWritable(file.latents, path);
+  requireWritable(file, path);
   openvdb::initialize();
   const std::pair<const char*, openvdb::GridBase::Ptr> named[] = {
       {kLatent, latentGrid(file.latents, path)},
@@ -240,17 +246,17 @@ LatentFile readLatentVdb(const std::string& path) {
           path, ": expected level 0-2 and dim 1-", kMaxDim, ", found level ", g.level, ", dim ",
           g.dim);
   for (const auto& [grid, level] : {std::pair<const openvdb::GridBase*, int>(tokens.get(), g.level),
-                                    {filled.get(), 0}, {empty.get(), 0}})
-    g.frame = exactFrame(
-        metadata, readVolume(kRead, metadata, grid->transform(), level, path), path);
+                                    {filled.get(), 0},
+                                    {empty.get(), 0}})
+    g.frame =
+        exactFrame(metadata, readVolume(kRead, metadata, grid->transform(), level, path), path);
   file.encoder_hash = findMetadata<std::string>(kRead, metadata, kHash, path);
   try {
     readTokens(*tokens, &g, path);
   } catch (const openvdb::Exception& error) {  // an attribute of another type
     throw Error(joinText(kRead, ": ", path, ": corrupt or unreadable: ", error.what()));
   }
-  file.seen.filled.root() =
-      maskOfGrid(kRead, *filled, g.frame.bounds, path).root();
+  file.seen.filled.root() = maskOfGrid(kRead, *filled, g.frame.bounds, path).root();
   file.seen.empty.root() = maskOfGrid(kRead, *empty, g.frame.bounds, path).root();
   return file;
 }

@@ -51,8 +51,7 @@ auto readHandle(const PointLeaf& leaf, const char* name) {
 }
 
 inline bool hasAttribute(const PointLeaf& leaf, const char* name) {
-  return leaf.attributeSet().descriptor().find(name) !=
-         openvdb::points::AttributeSet::INVALID_POS;
+  return leaf.attributeSet().descriptor().find(name) != openvdb::points::AttributeSet::INVALID_POS;
 }
 
 }  // namespace vdbc
