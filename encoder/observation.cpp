@@ -169,4 +169,21 @@ Observation observe(const std::vector<View>& views, const VoxelFrame& frame,
   return o;
 }
 
+std::vector<uint8_t> observedPixels(const View& view, const Observation& o, int level,
+                                    const CarveSettings& carving) {
+  const Camera& c = view.camera;
+  const std::vector<float> depth = usableDepth(view.depthView(), carving);
+  std::vector<uint8_t> observed(depth.size(), 0);
+  tbb::parallel_for(0, c.height, [&](int y) {
+    for (int x = 0; x < c.width; ++x) {
+      const size_t i = size_t(y) * size_t(c.width) + size_t(x);
+      if (depth[i] <= 0) continue;
+      const Eigen::Vector3d p = o.frame.toIndex(c.unproject(x + .5, y + .5, depth[i]));
+      const Coord ijk(int(std::floor(p.x())), int(std::floor(p.y())), int(std::floor(p.z())));
+      observed[i] = o.tokens.row(level, tokenCoord(ijk, level)) >= 0;
+    }
+  });
+  return observed;
+}
+
 }  // namespace vdbc

@@ -46,4 +46,9 @@ struct ObservationSettings {
 Observation observe(const std::vector<View>& views, const VoxelFrame& frame,
                     const ObservationSettings& settings, Progress& progress);
 
+/// The pixels of `view` whose surface was observed, [H * W], 1 or 0: those with a usable depth whose point
+/// lies in one of the observation's tokens of `level`. What a reconstruction can be held to.
+std::vector<uint8_t> observedPixels(const View& view, const Observation& observation, int level,
+                                    const CarveSettings& carving);
+
 }  // namespace vdbc

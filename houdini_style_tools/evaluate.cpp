@@ -3,38 +3,20 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <fstream>
-#include <limits>
 #include <map>
-#include <nlohmann/json.hpp>
 #include <numeric>
 #include <random>
-#include <set>
 
 #include "examples/rooms/rooms.h"
 #include "houdini_style_tools/scenes.h"
+#include "houdini_style_tools/scores.h"
 #include "splat/metrics.h"
 #include "splat/rasterize.h"
 
 namespace vdbc {
 namespace {
 
-constexpr int kTargetViews = 8;
 constexpr int kLeakRays = 8192;
-constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
-
-double secondsSince(std::chrono::steady_clock::time_point start) {
-  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-}
-
-// The kernel keeps the peak; writing 5 to clear_refs starts it afresh (Linux).
-void resetPeakMemory() { std::ofstream("/proc/self/clear_refs") << "5"; }
-double peakMemoryMb() {
-  std::ifstream status("/proc/self/status");
-  for (std::string line; std::getline(status, line);)
-    if (line.rfind("VmHWM:", 0) == 0) return std::atof(line.c_str() + 6) / 1024;
-  return kNan;
-}
 
 // What a method made: Gaussians to look at, voxels to trace and to count.
 struct MethodOutput {
@@ -204,13 +186,9 @@ MethodResult measure(const std::string& method, const EvaluationScene& scene, co
     if (unobserved(node)) truth.insert(node);
   for (const Coord& voxel : output.voxels)
     if (unobserved(tokenCoord(voxel, 1))) filled.insert(tokenCoord(voxel, 1));
-  double hit = 0;
-  for (const Coord& node : filled) hit += double(truth.count(node));
-  if (!filled.empty()) r.precision = hit / double(filled.size());
-  if (!truth.empty()) r.recall = hit / double(truth.size());
-  if (!truth.empty() || !filled.empty()) r.f1 = 2 * hit / double(truth.size() + filled.size());
-  r.leak = leakRate(RayTarget::fromMesh(*scene.truth), RayTarget::fromVoxels(frame, output.voxels),
-                    scene.free_points, kLeakRays, 2 * frame.voxel_m, 1);
+  const SetScores nodes = setScores(filled, truth);
+  r.precision = nodes.precision, r.recall = nodes.recall, r.f1 = nodes.f1;
+  r.leak = sceneLeak(scene, frame, output.voxels);
   return r;
 }
 
@@ -255,19 +233,30 @@ SceneList sceneList(const std::string& spec, int views, const std::vector<int>& 
           }};
 }
 
-std::string resultJson(const MethodResult& r) {
-  nlohmann::ordered_json j;
-  auto number = [](double v) { return std::isfinite(v) ? nlohmann::ordered_json(v) : nlohmann::ordered_json(); };
-  j["scene"] = r.scene, j["views"] = r.views, j["method"] = r.method;
-  j["psnr"] = number(r.psnr), j["ssim"] = number(r.ssim), j["flip"] = number(r.flip);
-  j["lpips"] = number(r.lpips), j["fid"] = number(r.fid), j["kid"] = number(r.kid);
-  j["depth_median_m"] = number(r.depth_median_m), j["depth_rmse_m"] = number(r.depth_rmse_m);
-  j["depth_share"] = number(r.depth_share);
-  j["precision"] = number(r.precision), j["recall"] = number(r.recall), j["f1"] = number(r.f1);
-  j["leak"] = number(r.leak), j["seconds"] = number(r.seconds);
-  j["peak_rss_mb"] = number(r.peak_rss_mb), j["gaussians"] = r.gaussians;
-  return j.dump();
+SetScores setScores(const std::set<Coord>& filled, const std::set<Coord>& truth) {
+  double hit = 0;
+  for (const Coord& node : filled) hit += double(truth.count(node));
+  return {filled.empty() ? kNan : hit / double(filled.size()), truth.empty() ? kNan : hit / double(truth.size()),
+          filled.empty() && truth.empty() ? kNan : 2 * hit / double(truth.size() + filled.size())};
 }
+
+double sceneLeak(const EvaluationScene& scene, const VoxelFrame& frame, const std::vector<Coord>& voxels) {
+  return leakRate(RayTarget::fromMesh(*scene.truth), RayTarget::fromVoxels(frame, voxels), scene.free_points,
+                  kLeakRays, 2 * frame.voxel_m, 1);
+}
+
+namespace {
+const std::vector<Score<MethodResult>> kScores = {
+    {"psnr", &MethodResult::psnr}, {"ssim", &MethodResult::ssim}, {"flip", &MethodResult::flip},
+    {"lpips", &MethodResult::lpips}, {"fid", &MethodResult::fid}, {"kid", &MethodResult::kid},
+    {"depth_median_m", &MethodResult::depth_median_m}, {"depth_rmse_m", &MethodResult::depth_rmse_m},
+    {"depth_share", &MethodResult::depth_share},
+    {"precision", &MethodResult::precision}, {"recall", &MethodResult::recall}, {"f1", &MethodResult::f1},
+    {"leak", &MethodResult::leak}, {"seconds", &MethodResult::seconds},
+    {"peak_rss_mb", &MethodResult::peak_rss_mb}};
+}  // namespace
+
+std::string resultJson(const MethodResult& r) { return scoresJson(r, kScores); }
 
 std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Encoder& encoder,
                                         const Completer& completer, const SceneSettings& settings,
@@ -323,36 +312,17 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
 }
 
 std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results) {
-  std::vector<std::string> methods;
-  for (const MethodResult& r : results)
-    if (std::find(methods.begin(), methods.end(), r.method) == methods.end()) methods.push_back(r.method);
-  std::vector<MethodResult> means;
-  for (const std::string& method : methods) {
-    MethodResult mean;
-    mean.scene = "mean", mean.method = method;
-    for (double MethodResult::*field :
-         {&MethodResult::psnr, &MethodResult::ssim, &MethodResult::flip, &MethodResult::lpips,
-          &MethodResult::depth_median_m, &MethodResult::depth_rmse_m, &MethodResult::depth_share,
-          &MethodResult::precision, &MethodResult::recall, &MethodResult::f1, &MethodResult::leak, &MethodResult::seconds, &MethodResult::peak_rss_mb}) {
-      double sum = 0, n = 0;
-      for (const MethodResult& r : results)
-        if (r.method == method && std::isfinite(r.*field)) sum += r.*field, ++n;
-      mean.*field = n > 0 ? sum / n : kNan;
-    }
-    int64_t gaussians = 0, n = 0;
-    std::vector<std::vector<float>> features, true_features;
+  std::vector<MethodResult> means = meanScores(results, kScores);
+  for (MethodResult& mean : means) {
     for (const MethodResult& r : results) {
-      if (r.method != method) continue;
-      gaussians += r.gaussians, ++n, mean.views = r.views;
-      features.insert(features.end(), r.features.begin(), r.features.end());
-      true_features.insert(true_features.end(), r.true_features.begin(), r.true_features.end());
+      if (r.method != mean.method) continue;
+      mean.features.insert(mean.features.end(), r.features.begin(), r.features.end());
+      mean.true_features.insert(mean.true_features.end(), r.true_features.begin(), r.true_features.end());
     }
-    if (features.size() > 1) {
-      const Eigen::MatrixXd a = rowsOf(true_features), b = rowsOf(features);
-      mean.fid = frechetDistance(a, b), mean.kid = kernelDistance(a, b);
-    }
-    mean.gaussians = gaussians / std::max<int64_t>(1, n);
-    means.push_back(mean);
+    if (mean.features.size() < 2) continue;
+    const Eigen::MatrixXd a = rowsOf(mean.true_features), b = rowsOf(mean.features);
+    mean.fid = frechetDistance(a, b), mean.kid = kernelDistance(a, b);
+    mean.features.clear(), mean.true_features.clear();
   }
   return means;
 }

@@ -4,6 +4,7 @@
 #include <limits>
 #include <memory>
 #include <optional>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -12,6 +13,9 @@
 #include "splat/embree_check.h"
 
 namespace vdbc {
+
+/// Views of a room that are not input.
+constexpr int kTargetViews = 8;
 
 /// One scene to evaluate: input views, target views and, for procedural rooms, the truth.
 struct EvaluationScene {
@@ -30,6 +34,16 @@ struct SceneList {
 };
 /// Throws UsageError for a malformed SPEC, Error for seeds reserved for training.
 SceneList sceneList(const std::string& spec, int views, const std::vector<int>& frames, uint64_t seed);
+
+/// A set of nodes against the true one; NaN is 0/0.
+struct SetScores {
+  double precision = 0, recall = 0, f1 = 0;
+};
+SetScores setScores(const std::set<Coord>& filled, const std::set<Coord>& truth);
+
+/// Share of rays from the free points of a scene with truth that meet none of `voxels` before they have
+/// passed the true surface by two voxels.
+double sceneLeak(const EvaluationScene& scene, const VoxelFrame& frame, const std::vector<Coord>& voxels);
 
 /// The user's own networks; null where there is none.
 struct UserNets {

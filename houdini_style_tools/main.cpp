@@ -14,7 +14,7 @@
 #include "houdini_style_tools/blas.h"
 #include "houdini_style_tools/complete.h"
 #include "houdini_style_tools/console.h"
-#include "houdini_style_tools/evaluate.h"
+#include "houdini_style_tools/reconstruct.h"
 #include "houdini_style_tools/render.h"
 #include "houdini_style_tools/scenes.h"
 #include "vdb/latent_vdb.h"
@@ -58,8 +58,10 @@ struct Check {
   double scale = 0;
 };
 struct Evaluate {
-  std::string scenes, frames, weights, lpips, features;
+  std::string scenes, frames, weights, lpips, features, pictures;
   int views = 2;
+  bool reconstruct = false;
+  double optimise_seconds = OptimiseSettings().seconds;
 };
 struct Train {
   std::string output, work, cache, preset = "small", encoder;
@@ -363,6 +365,36 @@ TrainProcesses processes() {
   return p;
 }
 
+void cookReconstruct(const Evaluate& o, const Complete& options, const Common& common, Progress& progress) {
+  const SceneList scenes = sceneList(o.scenes, o.views, frameList(o.frames), common.seed);
+  const Encoder encoder(weightsFolder(o.weights) + "/encoder.safetensors");
+  const SceneSettings settings = sceneSettings(options, common, Eigen::Vector3d::UnitZ());
+  std::vector<ReconstructionResult> all;
+  auto show = [&](const ReconstructionResult& r) {
+    if (common.json) {
+      std::printf("%s\n", reconstructionJson(r).c_str());
+    } else {
+      std::printf("%-14s %-14s input: psnr %6.2f  ssim %.3f  flip %.3f  others: psnr %6.2f  ssim %.3f  flip %.3f  voxels: precision %.3f  recall %.3f  f1 %.3f  leak %.3f  %6.2f + %.2f s  %5.0f MB  %lld\n",
+                  r.scene.c_str(), r.method.c_str(), r.input_psnr, r.input_ssim, r.input_flip, r.other_psnr,
+                  r.other_ssim, r.other_flip, r.voxel_precision, r.voxel_recall, r.voxel_f1, r.leak,
+                  r.encode_seconds, r.decode_seconds, r.peak_rss_mb, static_cast<long long>(r.gaussians));
+    }
+    std::fflush(stdout);
+  };
+  for (int64_t i = 0; i < scenes.count; ++i) {
+    const EvaluationScene scene = scenes.scene(i);
+    const std::string picture = o.pictures.empty() ? "" : joinText(o.pictures, "/", i, ".png");
+    if (!picture.empty()) requireCreatable(picture);
+    for (const ReconstructionResult& r : naming(scene.name, [&] {
+           return evaluateReconstruction(scene, encoder, settings, o.optimise_seconds, picture, progress);
+         })) {
+      show(r);
+      all.push_back(r);
+    }
+  }
+  for (const ReconstructionResult& r : meanReconstructions(all)) show(r);
+}
+
 TrainSettings trainSettings(const Train& t, const Common& common) {
   if (fs::path(t.output).extension() != ".safetensors")
     throw UsageError(joinText("--output: ", t.output, ": expected a name that ends in .safetensors"));
@@ -533,6 +565,30 @@ void addRender(CLI::App* verb, Render* o) {
   verb->add_option("-o,--output", s.output, "folder for 0000.png, ..., or a name with #### ending in .png or .exr")->required();
 }
 
+void addEvaluate(CLI::App* verb, Evaluate* o, Complete* options) {
+  constexpr int kReconstructionViews = 12;
+  verb->add_option("--scenes", o->scenes, "rooms:SEED-SEED, or a folder with transforms.json")->required();
+  auto* views = verb->add_option("--views", o->views, joinText("input views a scene [", o->views, "; ",
+                                                               kReconstructionViews, " with --reconstruct]"))
+                    ->check(CLI::Range(1, 1000));
+  verb->add_option("--frames", o->frames, "input frames of a folder [--views random ones]");
+  verb->add_option("--weights", o->weights, "folder with encoder.safetensors and completer.safetensors");
+  verb->add_option("--lpips", o->lpips, "your TorchScript network of two pictures [none]");
+  verb->add_option("--features", o->features, "your TorchScript network of one picture, for FID and KID [none]");
+  addCompletion(verb, options);
+  auto* reconstruct = verb->add_flag("--reconstruct", o->reconstruct, "no completion: what was observed, encoded and decoded, beside baselines");
+  for (const char* of_completion : {"--lpips", "--features", "--tau", "--coarse-tau", "--sampling-steps",
+                                    "--temperature", "--refine-observed"})
+    reconstruct->excludes(verb->get_option(of_completion));
+  verb->add_option("--optimise", o->optimise_seconds, "seconds a scene for the baseline of optimised Gaussians, 0 leaves it out")
+      ->check(Between(0, 86400))->capture_default_str()->needs(reconstruct);
+  verb->add_option("--pictures", o->pictures, "folder for a picture a scene: truth, reconstruction, baselines [none]")
+      ->needs(reconstruct);
+  verb->callback([=] {
+    if (o->reconstruct && !views->count()) o->views = kReconstructionViews;
+  });
+}
+
 void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rate) {
   verb->add_option("-o,--output", t->output, "weights to write (.safetensors)")->required();
   verb->add_option("--work", t->work, "folder for checkpoint, log and pictures [OUTPUT.work]");
@@ -590,13 +646,7 @@ int run(int argc, char** argv) {
   verb_check->add_option("--frames", check.frames, "which of the views [all]");
   addScale(verb_check, &check.scale);
   CLI::App* verb_eval = app.add_subcommand("eval", "compares all methods on scenes that were never trained on");
-  verb_eval->add_option("--scenes", evaluate.scenes, "rooms:SEED-SEED, or a folder with transforms.json")->required();
-  verb_eval->add_option("--views", evaluate.views, "input views a scene")->check(CLI::Range(1, 1000))->capture_default_str();
-  verb_eval->add_option("--frames", evaluate.frames, "input frames of a folder [--views random ones]");
-  addWeights(verb_eval, &evaluate.weights);
-  verb_eval->add_option("--lpips", evaluate.lpips, "your TorchScript network of two pictures [none]");
-  verb_eval->add_option("--features", evaluate.features, "your TorchScript network of one picture, for FID and KID [none]");
-  addCompletion(verb_eval, &eval_options);
+  addEvaluate(verb_eval, &evaluate, &eval_options);
   CLI::App* verb_train = app.add_subcommand("train", "trains a network on furnished rooms");
   verb_train->require_subcommand(1);
   CLI::App* train_encoder = verb_train->add_subcommand("encoder", "the encoder-decoder");
@@ -627,7 +677,7 @@ int run(int argc, char** argv) {
   } else if (verb_check->parsed()) {
     cookCheck(check, common);
   } else if (verb_eval->parsed()) {
-    cookEvaluate(evaluate, eval_options, common, console);
+    (evaluate.reconstruct ? cookReconstruct : cookEvaluate)(evaluate, eval_options, common, console);
   } else if (train_encoder->parsed()) {
     cookTrainEncoder(train, common, console);
   } else if (train_mar->parsed()) {

@@ -330,31 +330,23 @@ VDBC_VECTORISED void ssimDown(const float* __restrict a, const float* __restrict
   }
 }
 
-/// Filters the moments along the row; returns the sum of SSIM over its windows and channels.
-VDBC_VECTORISED double ssimAcross(const float* __restrict moments, size_t row, size_t channels,
-                                  const float* __restrict window) {
+/// Filters the moments along the row: SSIM of its windows and channels.
+VDBC_VECTORISED void ssimAcross(const float* __restrict moments, size_t row, size_t channels,
+                                const float* __restrict window, float* __restrict value) {
   constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
-  constexpr size_t kBlock = 64;  // values filtered, then summed in order
   const size_t count = row - (kSsimWindow - 1) * channels;
-  double sum = 0;
-  for (size_t begin = 0; begin < count; begin += kBlock) {
-    float value[kBlock];
-    const size_t size = std::min(kBlock, count - begin);
-    for (size_t i = 0; i < size; ++i) {
-      const float* from = moments + begin + i;
-      float m[5] = {};
-      for (size_t k = 0; k < kSsimWindow; ++k) {
-        for (size_t j = 0; j < 5; ++j) m[j] += window[k] * from[j * row + k * channels];
-      }
-      const float variances = (m[2] - m[0] * m[0]) + (m[3] - m[1] * m[1]);
-      const float covariance = m[4] - m[0] * m[1];
-      const float ma = m[0] + kSsimShift, mb = m[1] + kSsimShift;
-      value[i] = (2 * ma * mb + kC1) * (2 * covariance + kC2) /
-                 ((ma * ma + mb * mb + kC1) * (variances + kC2));
+  for (size_t i = 0; i < count; ++i) {
+    const float* from = moments + i;
+    float m[5] = {};
+    for (size_t k = 0; k < kSsimWindow; ++k) {
+      for (size_t j = 0; j < 5; ++j) m[j] += window[k] * from[j * row + k * channels];
     }
-    for (size_t i = 0; i < size; ++i) sum += double(value[i]);
+    const float variances = (m[2] - m[0] * m[0]) + (m[3] - m[1] * m[1]);
+    const float covariance = m[4] - m[0] * m[1];
+    const float ma = m[0] + kSsimShift, mb = m[1] + kSsimShift;
+    value[i] = (2 * ma * mb + kC1) * (2 * covariance + kC2) /
+               ((ma * ma + mb * mb + kC1) * (variances + kC2));
   }
-  return sum;
 }
 
 }  // namespace
@@ -481,25 +473,31 @@ double psnr(const Image& a, const Image& b) {
   return -10 * std::log10(sum / double(a.data.size()));
 }
 
-double ssim(const Image& a, const Image& b) {
+Image ssimMap(const Image& a, const Image& b) {
   requireSameSize("ssim", a, b);
   require(a.width >= kSsimWindow && a.height >= kSsimWindow,
           "ssim: expected images of at least 11 x 11 pixels, found ", a.width, " x ", a.height);
   const std::array<float, kSsimWindow> window = ssimWindow();
   const size_t row = size_t(a.width) * size_t(a.channels);
-  const size_t out_row = row - size_t(kSsimWindow - 1) * size_t(a.channels);
-  std::vector<double> sums(size_t(a.height) - kSsimWindow + 1);
-  tbb::parallel_for(tbb::blocked_range<size_t>(0, sums.size(), 8), [&](const auto& range) {
+  Image map(a.width - 2 * kSsimBorder, a.height - 2 * kSsimBorder, a.channels);
+  const size_t map_row = size_t(map.width) * size_t(map.channels);
+  tbb::parallel_for(tbb::blocked_range<size_t>(0, size_t(map.height), 8), [&](const auto& range) {
     std::vector<float> moments(5 * row);
     for (size_t y = range.begin(); y < range.end(); ++y) {
       ssimDown(a.data.data() + y * row, b.data.data() + y * row, row, window.data(),
                moments.data());
-      sums[y] = ssimAcross(moments.data(), row, size_t(a.channels), window.data());
+      ssimAcross(moments.data(), row, size_t(a.channels), window.data(),
+                 map.data.data() + y * map_row);
     }
   });
+  return map;
+}
+
+double ssim(const Image& a, const Image& b) {
+  const Image map = ssimMap(a, b);
   double sum = 0;
-  for (double s : sums) sum += s;
-  return sum / (double(sums.size()) * double(out_row));
+  for (float v : map.data) sum += double(v);
+  return sum / double(map.data.size());
 }
 
 }  // namespace vdbc

@@ -41,8 +41,12 @@ Image resizeImage(const Image& image, int width, int height);
 
 /// 10 log10(1 / mean squared error) over all values; infinity for equal images. Values are 0-1.
 double psnr(const Image& a, const Image& b);
-/// Mean SSIM (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, K1 .01, K2 .03, range 1, windows
-/// inside the image only, mean over channels.
+/// SSIM of each window and channel (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, K1 .01,
+/// K2 .03, range 1, windows inside the image only: [H - 10, W - 10, C], the first one's centre is pixel
+/// (kSsimBorder, kSsimBorder).
+constexpr int kSsimBorder = 5;
+Image ssimMap(const Image& a, const Image& b);
+/// Mean of ssimMap().
 double ssim(const Image& a, const Image& b);
 
 }  // namespace vdbc

@@ -264,6 +264,42 @@ double flip(const Image& reference, const Image& test, double pixels_per_degree)
   return sum / double(map.data.size());
 }
 
+PictureError pictureError(const Image& reference, const Image& test,
+                          const std::vector<uint8_t>& mask) {
+  requireColours("pictureError", reference);
+  requireColours("pictureError", test);
+  require(reference.width == test.width && reference.height == test.height &&
+              mask.size() == size_t(test.width) * size_t(test.height),
+          "pictureError: expected images and a mask of one size, found ", reference.width, " x ",
+          reference.height, ", ", test.width, " x ", test.height, " and ", mask.size(), " pixels");
+  Image seen = test;
+  PictureError e;
+  double squares = 0;
+  for (size_t i = 0; i < mask.size(); ++i)
+    for (size_t c = 3 * i; c < 3 * i + 3; ++c) {
+      if (!mask[i]) seen.data[c] = reference.data[c];
+      const double d = double(seen.data[c]) - double(reference.data[c]);
+      squares += d * d;
+    }
+  const Image flips = flipMap(reference, seen), similarities = ssimMap(reference, seen);
+  double flip_sum = 0, ssim_sum = 0, windows = 0;
+  for (int y = 0; y < test.height; ++y)
+    for (int x = 0; x < test.width; ++x) {
+      if (!mask[size_t(y) * size_t(test.width) + size_t(x)]) continue;
+      ++e.pixels;
+      flip_sum += double(flips.at(x, y, 0));
+      const int wx = x - kSsimBorder, wy = y - kSsimBorder;
+      if (wx < 0 || wy < 0 || wx >= similarities.width || wy >= similarities.height) continue;
+      for (int c = 0; c < 3; ++c) ssim_sum += double(similarities.at(wx, wy, c)) / 3;
+      ++windows;
+    }
+  constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
+  e.psnr = e.pixels ? -10 * std::log10(squares / (3 * double(e.pixels))) : kNan;
+  e.flip = e.pixels ? flip_sum / double(e.pixels) : kNan;
+  e.ssim = windows > 0 ? ssim_sum / windows : kNan;
+  return e;
+}
+
 DepthError depthError(const std::vector<float>& depth, const std::vector<float>& truth) {
   require(depth.size() == truth.size(), "depthError: expected ", truth.size(), " depths, found ",
           depth.size());

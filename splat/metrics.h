@@ -1,7 +1,8 @@
 #pragma once
-// How far images or their depth are from the true ones: FLIP, depth error, distances between sets
-// of features (PSNR and SSIM: image.h).
+// How far images or their depth are from the true ones: FLIP, errors over some pixels, depth error,
+// distances between sets of features (PSNR and SSIM of whole images: image.h).
 #include <Eigen/Core>
+#include <cstdint>
 #include <vector>
 
 #include "splat/image.h"
@@ -19,6 +20,19 @@ Image flipMap(const Image& reference, const Image& test,
 /// Mean of flipMap().
 double flip(const Image& reference, const Image& test,
             double pixels_per_degree = kFlipPixelsPerDegree);
+
+/// PSNR, SSIM and FLIP over some of the pixels; NaN where there are none.
+struct PictureError {
+  double psnr = 0, ssim = 0, flip = 0;
+  int64_t pixels = 0;
+};
+/// Over the pixels with a nonzero `mask`, [H * W]. PSNR: of their mean squared error. SSIM (windows
+/// inside the image only, as ssim() has them) and FLIP: means of the maps there, where the other
+/// pixels of `test` take the reference's colour before any filter: nothing outside the mask is held
+/// against the picture, and what is outside in the reference stays the same surroundings in both.
+/// Images as flipMap() wants them, at least 11 x 11 pixels.
+PictureError pictureError(const Image& reference, const Image& test,
+                          const std::vector<uint8_t>& mask);
 
 /// Over the pixels where both depths are positive and finite; NaN where there are none.
 struct DepthError {

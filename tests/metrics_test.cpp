@@ -128,6 +128,62 @@ TEST(Flip, RefusesWhatItCannotCompare) {
     EXPECT_THROW(flip(Image(8, 8, 3), Image(8, 8, 3), ppd), Error);
 }
 
+TEST(PictureErrorOf, AllPixelsGiveTheWholeImagesMetrics) {
+  const Image a = pattern(0), b = pattern(1);
+  const PictureError e = pictureError(a, b, std::vector<uint8_t>(96 * 64, 1));
+  EXPECT_NEAR(e.psnr, psnr(a, b), 1e-9);
+  EXPECT_NEAR(e.ssim, ssim(a, b), 1e-9);
+  EXPECT_NEAR(e.flip, flip(a, b), 1e-9);
+  EXPECT_EQ(e.pixels, 96 * 64);
+}
+
+TEST(PictureErrorOf, AStripeHasAClosedForm) {
+  // Columns below 16 are wrong by a constant and count; the others, wrong in any way, do not.
+  constexpr int kSide = 40, kEdge = 16;
+  const double a = .2, b = .6;
+  const Image reference(kSide, kSide, 3, float(a));
+  Image test = pattern(3, kSide, kSide);
+  std::vector<uint8_t> mask(kSide * kSide, 0);
+  for (int y = 0; y < kSide; ++y)
+    for (int x = 0; x < kEdge; ++x) {
+      mask[size_t(y * kSide + x)] = 1;
+      for (int c = 0; c < 3; ++c) test.at(x, y, c) = float(b);
+    }
+  const PictureError e = pictureError(reference, test, mask);
+  EXPECT_EQ(e.pixels, kSide * kEdge);
+  EXPECT_NEAR(e.psnr, -20 * std::log10(b - a), 1e-5);
+  // Of a window, the share w is wrong: mean and variance of two values, covariance 0.
+  double sum = 0, total = 0, expected = 0;
+  for (int d = -5; d <= 5; ++d) total += std::exp(-d * d / 4.5);
+  for (int x = 5; x < kEdge; ++x) {
+    double w = 0;
+    for (int d = -5; d <= 5; ++d)
+      if (x + d < kEdge) w += std::exp(-d * d / 4.5) / total;
+    const double mean = a + (b - a) * w, variance = (b - a) * (b - a) * w * (1 - w);
+    expected += (2 * a * mean + 1e-4) * 9e-4 / ((a * a + mean * mean + 1e-4) * (variance + 9e-4));
+    ++sum;
+  }
+  EXPECT_NEAR(e.ssim, expected / sum, 1e-4);
+  // FLIP: as of the picture that is right elsewhere.
+  Image right = reference;
+  for (int y = 0; y < kSide; ++y)
+    for (int x = 0; x < kEdge; ++x)
+      for (int c = 0; c < 3; ++c) right.at(x, y, c) = float(b);
+  const Image map = flipMap(reference, right);
+  double flips = 0;
+  for (size_t i = 0; i < mask.size(); ++i) flips += mask[i] ? double(map.data[i]) : 0;
+  EXPECT_NEAR(e.flip, flips / (kSide * kEdge), 1e-9);
+}
+
+TEST(PictureErrorOf, RefusesWhatDoesNotFit) {
+  const Image a = pattern(0);
+  const PictureError none = pictureError(a, pattern(1), std::vector<uint8_t>(96 * 64, 0));
+  for (double v : {none.psnr, none.ssim, none.flip}) EXPECT_TRUE(std::isnan(v));
+  EXPECT_THROW(pictureError(a, a, std::vector<uint8_t>(96 * 63, 1)), Error);
+  EXPECT_THROW(pictureError(a, pattern(0, 64, 96), std::vector<uint8_t>(96 * 64, 1)), Error);
+  EXPECT_THROW(pictureError(Image(16, 16, 1), Image(16, 16, 1), std::vector<uint8_t>(256, 1)), Error);
+}
+
 TEST(DepthErrorOf, ComparesWhereBothAreMeasured) {
   const DepthError e = depthError({1, 2, 0, kNan, 5, 9}, {1.1f, 1.5f, 3, 4, 0, 6});
   EXPECT_NEAR(e.median_abs_m, .5, 1e-6);  // of .1, .5 and 3

@@ -244,5 +244,25 @@ TEST(Observation, NothingInTheBoundsThrows) {
   EXPECT_THROW(observed({blind}, frame, 4), Error);
 }
 
+TEST(ObservedPixels, AreThoseWhosePointsLieInAnObservedToken) {
+  std::vector<View> views = roomViews();
+  const View other = views.back();
+  views.pop_back();
+  const VoxelFrame frame = fittedFrame(views, .1f);
+  const Observation o = observed(views, frame, 4);
+  const auto size = size_t(other.camera.width) * size_t(other.camera.height);
+  for (int level = 0; level < kTokenLevels; ++level) {
+    std::set<Coord> tokens;
+    for (const Pixel& p : usablePixels(views, frame)) tokens.insert(tokenCoord(p.voxel, level));
+    std::vector<uint8_t> expected(size, 0);
+    for (const Pixel& p : usablePixels({other}, frame))
+      expected[size_t(p.y * other.camera.width + p.x)] = uint8_t(tokens.count(tokenCoord(p.voxel, level)));
+    const auto count = std::count(expected.begin(), expected.end(), 1);
+    EXPECT_GT(count, 0);
+    EXPECT_LT(size_t(count), size);
+    EXPECT_EQ(observedPixels(other, o, level, CarveSettings()), expected);
+  }
+}
+
 }  // namespace
 }  // namespace vdbc

@@ -753,6 +753,45 @@ TEST_F(Program, EvalPrintsEveryMethodOnce) {
                 folder);
 }
 
+TEST_F(Program, EvalReconstructNeedsOnlyTheEncoder) {
+  NEEDS_WEIGHTS();
+  const std::string folder = writeRoom("views", 3), weights = at("weights");
+  fs::create_directory(weights);
+  fs::copy(VDBC_WEIGHTS "/encoder.safetensors", weights);
+  const Ended ended = run({"eval", "--reconstruct", "--scenes", folder, "--views", "2", "--weights", weights,
+                           "--optimise", "0.2", "--pictures", at("pictures"), "--json"});
+  ASSERT_EQ(ended.code, kOk) << ended.err;
+  Args methods;
+  for (const std::string& line : lines(ended.out)) {
+    const json result = json::parse(line);
+    methods.push_back(result.at("scene").get<std::string>() == "mean" ? "mean" : result.at("method"));
+    EXPECT_EQ(result.at("views"), 2);
+    EXPECT_TRUE(result.at("leak").is_null());  // no truth
+    for (const char* kind : {"input", "other"}) {
+      EXPECT_GT(result.at(std::string(kind) + "_psnr").get<double>(), 5);
+      EXPECT_GT(result.at(std::string(kind) + "_flip").get<double>(), 0);
+    }
+    EXPECT_EQ(result.at("decode_seconds").is_null(), result.at("method") != "reconstructed");
+  }
+  EXPECT_EQ(methods, (Args{"reconstructed", "voxel-mean", "pixel-aligned", "optimised", "mean", "mean", "mean",
+                           "mean"}));
+  const Image sheet = readImage(at("pictures/0.png"));
+  EXPECT_EQ(sheet.width % 5, 0);   // the truth and four methods
+  EXPECT_EQ(sheet.height % 3, 0);  // two input views and the one other
+}
+
+TEST_F(Program, EvalReconstructRefusesOptionsOfTheCompletion) {
+  const Args reconstruct = {"eval", "--scenes", "rooms:1", "--reconstruct"};
+  for (const Args& more : std::vector<Args>{{"--tau", ".1"}, {"--lpips", "x.pt"}, {"--refine-observed"},
+                                            {"--optimise", "-1"}, {"--optimise", "nan"}}) {
+    Args args = reconstruct;
+    args.insert(args.end(), more.begin(), more.end());
+    expectFailure(args, kUsage, more[0]);
+  }
+  expectFailure({"eval", "--scenes", "rooms:1", "--optimise", "1"}, kUsage, "--reconstruct");
+  expectFailure({"eval", "--scenes", "rooms:1", "--pictures", at("p")}, kUsage, "--reconstruct");
+}
+
 TEST_F(Program, AnInterruptLeavesNothing) {
   NEEDS_WEIGHTS();
   const std::string views = writeRoom("views");

@@ -1,0 +1,293 @@
+#include "houdini_style_tools/reconstruct.h"
+
+#include <torch/optim/adam.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <cstring>
+#include <random>
+
+#include "examples/rooms/rooms.h"
+#include "houdini_style_tools/scores.h"
+#include "splat/metrics.h"
+#include "splat/rasterize.h"
+#include "splat/rasterize_torch.h"
+
+namespace vdbc {
+namespace {
+
+using Clock = std::chrono::steady_clock;
+using Mask = std::vector<uint8_t>;
+
+constexpr float kOpaqueLogit = 5;      // .993; the rasteriser stops at .99
+constexpr double kLeastObserved = .01;  // share of a view's pixels, below which it says nothing
+
+void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vector3f& srgb, Gaussians* g) {
+  g->mean.push_back(mean.cast<float>());
+  g->log_scale.push_back(Eigen::Vector3f::Constant(float(std::log(sigma_m))));
+  g->rotation.emplace_back(1, 0, 0, 0);
+  g->opacity_logit.push_back(kOpaqueLogit);
+  for (int c = 0; c < 3; ++c) g->sh.push_back((srgb[c] - .5f) / kSh0);
+}
+
+// Views and which of their pixels count.
+struct JudgedViews {
+  std::vector<View> views;
+  std::vector<Mask> observed;
+};
+
+JudgedViews judged(std::vector<View> views, const Observation& o, int level, const CarveSettings& carving) {
+  JudgedViews j{std::move(views), {}};
+  for (const View& v : j.views) j.observed.push_back(observedPixels(v, o, level, carving));
+  return j;
+}
+
+// At most kTargetViews, spread evenly.
+std::vector<View> fewOf(const std::vector<View>& all) {
+  const size_t n = std::min(all.size(), size_t(kTargetViews));
+  std::vector<View> few;
+  for (size_t i = 0; i < n; ++i) few.push_back(all[i * all.size() / n]);
+  return few;
+}
+
+// Mean over the views; keeps the first pictures in `shown`.
+PictureError meanError(const JudgedViews& judged, const Gaussians& gaussians, size_t show,
+                       std::vector<Image>* shown) {
+  RasterSettings settings;
+  settings.antialias = gaussians.antialias;
+  PictureError mean;
+  double n = 0;
+  for (size_t i = 0; i < judged.views.size(); ++i) {
+    Image colour = rasterize(gaussians, judged.views[i].camera, settings).colour;
+    for (float& v : colour.data) v = std::clamp(v, 0.f, 1.f);
+    const PictureError e = pictureError(judged.views[i].colour, colour, judged.observed[i]);
+    if (i < show) shown->push_back(std::move(colour));
+    if (double(e.pixels) < kLeastObserved * double(judged.observed[i].size())) continue;
+    mean.psnr += e.psnr, mean.ssim += e.ssim, mean.flip += e.flip, mean.pixels += e.pixels, ++n;
+  }
+  mean.psnr /= n, mean.ssim /= n, mean.flip /= n;  // NaN without views
+  return mean;
+}
+
+constexpr size_t kShownViews = 2;  // of each kind
+
+// One column a method, one row a view. Views may differ in size.
+void writeColumns(const std::vector<std::vector<Image>>& columns, const std::string& path) {
+  const int width = columns[0][0].width, height = columns[0][0].height;
+  Image sheet(width * int(columns.size()), height * int(columns[0].size()), 3);
+  for (size_t c = 0; c < columns.size(); ++c)
+    for (size_t r = 0; r < columns[c].size(); ++r) {
+      const Image tile = resizeImage(columns[c][r], width, height);
+      for (int y = 0; y < height; ++y)
+        std::copy_n(&tile.data[size_t(y) * size_t(width) * 3], size_t(width) * 3,
+                    &sheet.at(int(c) * width, int(r) * height + y, 0));
+    }
+  writePng(sheet, path);
+}
+
+template <typename T>
+at::Tensor parameterOf(const std::vector<T>& values, at::IntArrayRef shape) {
+  at::Tensor t = torch::empty(shape);
+  std::memcpy(t.data_ptr<float>(), values.data(), t.nbytes());
+  return t.requires_grad_();
+}
+
+template <typename T>
+void copyBack(const at::Tensor& from, std::vector<T>* to) {
+  std::memcpy(static_cast<void*>(to->data()), from.data_ptr<float>(), from.nbytes());
+}
+
+const std::vector<Score<ReconstructionResult>> kScores = {
+    {"input_psnr", &ReconstructionResult::input_psnr}, {"input_ssim", &ReconstructionResult::input_ssim},
+    {"input_flip", &ReconstructionResult::input_flip}, {"other_psnr", &ReconstructionResult::other_psnr},
+    {"other_ssim", &ReconstructionResult::other_ssim}, {"other_flip", &ReconstructionResult::other_flip},
+    {"voxel_precision", &ReconstructionResult::voxel_precision},
+    {"voxel_recall", &ReconstructionResult::voxel_recall}, {"voxel_f1", &ReconstructionResult::voxel_f1},
+    {"node_precision", &ReconstructionResult::node_precision},
+    {"node_recall", &ReconstructionResult::node_recall}, {"node_f1", &ReconstructionResult::node_f1},
+    {"leak", &ReconstructionResult::leak}, {"encode_seconds", &ReconstructionResult::encode_seconds},
+    {"decode_seconds", &ReconstructionResult::decode_seconds}, {"peak_rss_mb", &ReconstructionResult::peak_rss_mb}};
+
+}  // namespace
+
+std::string reconstructionJson(const ReconstructionResult& r) { return scoresJson(r, kScores); }
+
+std::vector<ReconstructionResult> meanReconstructions(const std::vector<ReconstructionResult>& results) {
+  return meanScores(results, kScores);
+}
+
+Gaussians voxelMean(const Observation& o, int per_axis) {
+  Gaussians g;
+  for (int64_t v = 0; v < o.tokens.size(0); ++v) {
+    const Coord ijk = o.tokens.coords(0)[size_t(v)];
+    const float* features = &o.voxel_features[size_t(v) * kVoxelFeatures];
+    const Eigen::Vector3f srgb(features[32], features[33], features[34]);
+    for (int i = 0; i < per_axis * per_axis * per_axis; ++i) {
+      const Eigen::Vector3d cell(i / (per_axis * per_axis), i / per_axis % per_axis, i % per_axis);
+      const Eigen::Vector3d index = ijk.asVec3d().x() * Eigen::Vector3d::UnitX() +
+                                    ijk.asVec3d().y() * Eigen::Vector3d::UnitY() +
+                                    ijk.asVec3d().z() * Eigen::Vector3d::UnitZ() +
+                                    (cell.array() + .5).matrix() / per_axis;
+      addIsotropic(o.frame.toWorld(index), .5 * o.frame.voxel_m / per_axis, srgb, &g);
+    }
+  }
+  return g;
+}
+
+Gaussians pixelAligned(const std::vector<View>& views, const std::vector<Mask>& observed) {
+  constexpr double kSigmaPixels = .5;
+  Gaussians g;
+  for (size_t i = 0; i < views.size(); ++i) {
+    const View& v = views[i];
+    for (int y = 0; y < v.camera.height; ++y)
+      for (int x = 0; x < v.camera.width; ++x) {
+        const size_t p = size_t(y) * size_t(v.camera.width) + size_t(x);
+        if (!observed[i][p]) continue;
+        const double z = v.depth[p];
+        addIsotropic(v.camera.unproject(x + .5, y + .5, z),
+                     kSigmaPixels * z / std::sqrt(v.camera.fx * v.camera.fy),
+                     {v.colour.at(x, y, 0), v.colour.at(x, y, 1), v.colour.at(x, y, 2)}, &g);
+      }
+  }
+  return g;
+}
+
+Gaussians optimised(const Gaussians& start, const std::vector<View>& views, const std::vector<Mask>& observed,
+                    const OptimiseSettings& s, Progress& progress) {
+  const auto started = Clock::now();
+  const int64_t n = start.size();
+  at::Tensor mean = parameterOf(start.mean, {n, 3}), log_scale = parameterOf(start.log_scale, {n, 3});
+  at::Tensor rotation = parameterOf(start.rotation, {n, 4}), opacity = parameterOf(start.opacity_logit, {n});
+  at::Tensor sh = parameterOf(start.sh, {n, start.shCoefficients(), 3});
+  std::vector<torch::optim::OptimizerParamGroup> groups;
+  auto add = [&](const at::Tensor& parameter, double rate) {
+    groups.emplace_back(std::vector<at::Tensor>{parameter},
+                        std::make_unique<torch::optim::AdamOptions>(torch::optim::AdamOptions(rate).eps(1e-15)));
+  };
+  add(mean, 1e-3), add(log_scale, 2e-2), add(rotation, 4e-3), add(opacity, 5e-2), add(sh, 1e-2);
+  torch::optim::Adam adam(groups, torch::optim::AdamOptions());
+
+  std::vector<at::Tensor> colours, masks;
+  for (size_t i = 0; i < views.size(); ++i) {
+    const int64_t h = views[i].camera.height, w = views[i].camera.width;
+    colours.push_back(torch::tensor(views[i].colour.data).view({h, w, 3}));
+    masks.push_back(torch::tensor(observed[i]).view({h, w, 1}).to(torch::kFloat32));
+  }
+  std::mt19937_64 random(s.seed);
+  RasterSettings raster;
+  raster.antialias = start.antialias;
+  for (int64_t step = 0; step < s.max_steps && secondsSince(started) < s.seconds; ++step) {
+    const size_t i = random() % views.size();
+    const at::Tensor image =
+        rasterizeTorch(mean, log_scale, rotation, opacity, sh, views[i].camera, raster).slice(2, 0, 3);
+    adam.zero_grad();
+    (((image - colours[i]).square() * masks[i]).sum() / (3 * masks[i].sum()).clamp_min(1)).backward();
+    adam.step();
+    report(progress, int(100 * std::max(double(step) / double(s.max_steps), secondsSince(started) / s.seconds)));
+  }
+  Gaussians g = start;
+  copyBack(mean, &g.mean), copyBack(log_scale, &g.log_scale), copyBack(rotation, &g.rotation);
+  copyBack(opacity, &g.opacity_logit), copyBack(sh, &g.sh);
+  return g;
+}
+
+SetScores splitScores(const TriangleMesh& truth, const Observation& o, const std::vector<Coord>& voxels, int level) {
+  openvdb::tree::ValueAccessor<const TokenMask> empty(o.space.empty);
+  const int side = 1 << level;
+  const auto unseen = [&](const Coord& child) {
+    if (o.tokens.row(level + 1, tokenCoord(child, 1)) < 0 || o.tokens.row(level, child) >= 0) return false;
+    for (int v = 0; v < side * side * side; ++v)
+      if (!empty.isValueOn(Coord(child.x() * side + v / (side * side), child.y() * side + v / side % side,
+                                 child.z() * side + v % side)))
+        return true;
+    return false;
+  };
+  std::set<Coord> surface, filled;
+  for (const Coord& child : surfaceNodes(truth, o.frame, level))
+    if (unseen(child)) surface.insert(child);
+  for (const Coord& voxel : voxels)
+    if (unseen(tokenCoord(voxel, level))) filled.insert(tokenCoord(voxel, level));
+  return setScores(filled, surface);
+}
+
+std::vector<ReconstructionResult> evaluateReconstruction(const EvaluationScene& scene, const Encoder& encoder,
+                                                         const SceneSettings& settings, double optimise_seconds,
+                                                         const std::string& picture, Progress& progress) {
+  SceneSettings s = settings;
+  s.volume.up = scene.up;
+  const int level = encoder.config().levels;
+
+  resetPeakMemory();
+  progress.start("encode");
+  auto start = Clock::now();
+  const Observation o = observeScene(scene.input, encoder, s, progress);
+  const double observe_seconds = secondsSince(start);
+  const LatentGrid latents = encoder.encode(scene.input, o, progress);
+  const double encode_seconds = secondsSince(start);
+  progress.end();
+  progress.start("decode");
+  start = Clock::now();
+  const DecodedGrid decoded = encoder.decode(latents, o.space, s.child_threshold, progress);
+  const double decode_seconds = secondsSince(start);
+  progress.end();
+
+  const JudgedViews input = judged(scene.input, o, level, s.carving);
+  const JudgedViews others = judged(fewOf(scene.targets), o, level, s.carving);
+  std::vector<ReconstructionResult> results;
+  std::vector<std::vector<Image>> columns(1);
+  for (const JudgedViews* j : {&input, &others})
+    for (size_t i = 0; i < std::min(kShownViews, j->views.size()); ++i) columns[0].push_back(j->views[i].colour);
+  auto measure = [&](const char* method, const Gaussians& gaussians, double seconds) -> ReconstructionResult& {
+    ReconstructionResult r;
+    r.peak_rss_mb = peakMemoryMb();  // before it is looked at
+    r.scene = scene.name, r.method = method, r.views = int(scene.input.size()), r.gaussians = gaussians.size();
+    columns.emplace_back();
+    const PictureError a = meanError(input, gaussians, kShownViews, &columns.back());
+    const PictureError b = meanError(others, gaussians, kShownViews, &columns.back());
+    r.input_psnr = a.psnr, r.input_ssim = a.ssim, r.input_flip = a.flip;
+    r.other_psnr = b.psnr, r.other_ssim = b.ssim, r.other_flip = b.flip;
+    r.voxel_precision = r.voxel_recall = r.voxel_f1 = r.node_precision = r.node_recall = r.node_f1 = kNan;
+    r.leak = r.decode_seconds = kNan;
+    r.encode_seconds = seconds;
+    results.push_back(r);
+    resetPeakMemory();
+    start = Clock::now();
+    return results.back();
+  };
+
+  ReconstructionResult& ours = measure("reconstructed", decoded.gaussians, encode_seconds);
+  ours.decode_seconds = decode_seconds;
+  if (scene.truth) {
+    if (level > 0) {
+      const SetScores split = splitScores(*scene.truth, o, decoded.voxels, 0);
+      ours.voxel_precision = split.precision, ours.voxel_recall = split.recall, ours.voxel_f1 = split.f1;
+    }
+    if (level > 1) {
+      const SetScores split = splitScores(*scene.truth, o, decoded.voxels, 1);
+      ours.node_precision = split.precision, ours.node_recall = split.recall, ours.node_f1 = split.f1;
+    }
+    ours.leak = sceneLeak(scene, o.frame, decoded.voxels);
+    start = Clock::now();
+  }
+  const Gaussians means = voxelMean(o, encoder.config().gaussians_per_axis);
+  ReconstructionResult& voxel_mean = measure("voxel-mean", means, observe_seconds + secondsSince(start));
+  if (scene.truth) voxel_mean.leak = sceneLeak(scene, o.frame, o.tokens.coords(0));
+  start = Clock::now();
+  {
+    const Gaussians pixels = pixelAligned(input.views, input.observed);
+    measure("pixel-aligned", pixels, observe_seconds + secondsSince(start));
+  }
+  if (optimise_seconds > 0) {
+    progress.start("optimise");
+    OptimiseSettings optimise;
+    optimise.seconds = optimise_seconds, optimise.seed = s.completion.seed;
+    const Gaussians best = optimised(means, input.views, input.observed, optimise, progress);
+    progress.end();
+    measure("optimised", best, observe_seconds + secondsSince(start));
+  }
+  if (!picture.empty()) writeColumns(columns, picture);
+  return results;
+}
+
+}  // namespace vdbc

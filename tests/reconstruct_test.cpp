@@ -1,0 +1,153 @@
+// The baselines of the reconstruction, and what counts there.
+#include "houdini_style_tools/reconstruct.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "splat/metrics.h"
+#include "splat/rasterize.h"
+#include "tests/simple_room.h"
+
+namespace vdbc {
+namespace {
+
+constexpr uint64_t kRoom = 41;
+
+struct Place {
+  std::vector<View> views;
+  Observation observation;
+  std::vector<std::vector<uint8_t>> observed;
+};
+
+Place placeOf(std::vector<View> views) {
+  std::vector<DepthView> depth;
+  for (const View& v : views) depth.push_back(v.depthView());
+  Progress silent;
+  Observation o = observe(views, fitVolume(depth, VolumeSettings(), CarveSettings()), ObservationSettings(), silent);
+  Place place{std::move(views), std::move(o), {}};
+  for (const View& v : place.views) place.observed.push_back(observedPixels(v, place.observation, 1, CarveSettings()));
+  return place;
+}
+
+const Place& simplePlace() {
+  static const Place place = placeOf(simpleRoomViews(4, 96, 72, kRoom));
+  return place;
+}
+
+double meanPsnr(const Gaussians& g, const Place& place) {
+  double sum = 0;
+  for (size_t i = 0; i < place.views.size(); ++i)
+    sum += pictureError(place.views[i].colour, rasterize(g, place.views[i].camera, {}).colour, place.observed[i]).psnr;
+  return sum / double(place.views.size());
+}
+
+TEST(Reconstruct, VoxelMeanOfOneColourHasThatColour) {
+  std::vector<View> views = simpleRoomViews(4, 96, 72, kRoom);
+  const float colour[3] = {.2f, .5f, .7f};
+  for (View& v : views)
+    for (size_t i = 0; i < v.colour.data.size(); ++i) v.colour.data[i] = colour[i % 3];
+  const Place place = placeOf(std::move(views));
+  const Gaussians g = voxelMean(place.observation, 2);
+  ASSERT_EQ(g.size(), 8 * place.observation.tokens.size(0));
+  for (size_t i = 0; i < g.sh.size(); ++i) ASSERT_NEAR(.5f + kSh0 * g.sh[i], colour[i % 3], 1e-5);
+  EXPECT_GT(meanPsnr(g, place), 30);
+}
+
+TEST(Reconstruct, VoxelMeanLiesOnTheSubLattice) {
+  const Observation& o = simplePlace().observation;
+  const Gaussians g = voxelMean(o, 3);
+  for (size_t i = 0; i < g.mean.size(); ++i) {
+    const Eigen::Vector3d index = o.frame.toIndex(g.mean[i].cast<double>());
+    const Coord voxel = o.tokens.coords(0)[i / 27];
+    const int cell[3] = {int(i % 27) / 9, int(i % 9) / 3, int(i % 3)};
+    for (int axis = 0; axis < 3; ++axis)
+      ASSERT_NEAR(index[axis], voxel[axis] + (cell[axis] + .5) / 3, 1e-4);
+    ASSERT_NEAR(std::exp(g.log_scale[i].x()), o.frame.voxel_m / 6, 1e-6);
+  }
+}
+
+TEST(Reconstruct, PixelAlignedReproducesTheInput) {
+  const Place& place = simplePlace();
+  const Place one = placeOf({place.views[0]});
+  EXPECT_GT(meanPsnr(pixelAligned(one.views, one.observed), one), 30);
+  const Gaussians all = pixelAligned(place.views, place.observed);
+  int64_t pixels = 0;
+  for (const auto& mask : place.observed) pixels += std::count(mask.begin(), mask.end(), 1);
+  EXPECT_EQ(all.size(), pixels);
+  EXPECT_GT(meanPsnr(all, place), meanPsnr(voxelMean(place.observation, 2), place) + 2);
+}
+
+TEST(Reconstruct, OptimisingBeatsItsStart) {
+  const Place& place = simplePlace();
+  const Gaussians start = voxelMean(place.observation, 2);
+  OptimiseSettings settings;
+  settings.seconds = 1e9, settings.max_steps = 40;
+  Progress silent;
+  const Gaussians better = optimised(start, place.views, place.observed, settings, silent);
+  EXPECT_GT(meanPsnr(better, place), meanPsnr(start, place) + 2);
+  settings.max_steps = 0;
+  EXPECT_EQ(optimised(start, place.views, place.observed, settings, silent).mean, start.mean);
+}
+
+TEST(Reconstruct, AnInterruptedOptimisationStops) {
+  struct Impatient : Progress {
+    bool wasInterrupted(int) override { return true; }
+  } impatient;
+  const Place& place = simplePlace();
+  EXPECT_THROW(optimised(voxelMean(place.observation, 1), place.views, place.observed, {}, impatient), Cancelled);
+}
+
+TEST(Reconstruct, SplitScoresKnowTheTruth) {
+  const Observation& o = simplePlace().observation;
+  const TriangleMesh truth = solidMesh(simpleRoom(kRoom).surface);
+  for (int level : {0, 1}) {
+    const std::vector<Coord>& parents = o.tokens.coords(level + 1);
+    std::vector<Coord> everything, surface;  // voxels of the children
+    const std::vector<Coord> nodes = surfaceNodes(truth, o.frame, level);
+    const std::set<Coord> true_nodes(nodes.begin(), nodes.end());
+    for (const Coord& parent : parents)
+      for (int slot = 0; slot < 8; ++slot) {
+        const Coord child = childCoord(parent, slot), voxel = level ? childCoord(child, 0) : child;
+        everything.push_back(voxel);
+        if (true_nodes.count(child)) surface.push_back(voxel);
+      }
+    const SetScores exact = splitScores(truth, o, surface, level);
+    EXPECT_EQ(exact.precision, 1);
+    EXPECT_EQ(exact.recall, 1);
+    EXPECT_EQ(exact.f1, 1);
+    const SetScores all = splitScores(truth, o, everything, level);
+    EXPECT_EQ(all.recall, 1);
+    EXPECT_GT(all.precision, 0);
+    EXPECT_LT(all.precision, 1);
+    const SetScores seen = splitScores(truth, o, o.tokens.coords(0), level);  // adds nothing to what was seen
+    EXPECT_TRUE(std::isnan(seen.precision));
+    EXPECT_EQ(seen.recall, 0);
+  }
+}
+
+TEST(Reconstruct, SetScoresCount) {
+  const SetScores s = setScores({{0, 0, 0}, {0, 0, 1}, {0, 0, 2}}, {{0, 0, 1}, {0, 0, 2}, {0, 0, 3}, {0, 0, 4}});
+  EXPECT_DOUBLE_EQ(s.precision, 2 / 3.);
+  EXPECT_DOUBLE_EQ(s.recall, .5);
+  EXPECT_DOUBLE_EQ(s.f1, 4 / 7.);
+}
+
+TEST(Reconstruct, MeansLeaveOutWhatIsNotThere) {
+  std::vector<ReconstructionResult> results(3);
+  results[0].method = results[1].method = "a", results[2].method = "b";
+  results[0].input_psnr = 20, results[1].input_psnr = 30;
+  results[0].leak = std::numeric_limits<double>::quiet_NaN(), results[1].leak = .5;
+  results[0].gaussians = 10, results[1].gaussians = 20;
+  const std::vector<ReconstructionResult> means = meanReconstructions(results);
+  ASSERT_EQ(means.size(), 2u);
+  EXPECT_EQ(means[0].scene, "mean");
+  EXPECT_EQ(means[0].input_psnr, 25);
+  EXPECT_EQ(means[0].leak, .5);
+  EXPECT_EQ(means[0].gaussians, 15);
+}
+
+}  // namespace
+}  // namespace vdbc
