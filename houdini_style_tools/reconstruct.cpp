@@ -136,7 +136,7 @@ Gaussians voxelMean(const Observation& o, int per_axis) {
 }
 
 Gaussians pixelAligned(const std::vector<View>& views, const std::vector<Mask>& observed) {
-  constexpr double kSigmaPixels = .5;
+  constexpr double kSigmaPixels = .4;
   Gaussians g;
   for (size_t i = 0; i < views.size(); ++i) {
     const View& v = views[i];
@@ -165,7 +165,7 @@ Gaussians optimised(const Gaussians& start, const std::vector<View>& views, cons
     groups.emplace_back(std::vector<at::Tensor>{parameter},
                         std::make_unique<torch::optim::AdamOptions>(torch::optim::AdamOptions(rate).eps(1e-15)));
   };
-  add(mean, 1e-3), add(log_scale, 2e-2), add(rotation, 4e-3), add(opacity, 5e-2), add(sh, 1e-2);
+  add(mean, 2e-3), add(log_scale, 2e-2), add(rotation, 4e-3), add(opacity, 5e-2), add(sh, 1e-2);
   torch::optim::Adam adam(groups, torch::optim::AdamOptions());
 
   std::vector<at::Tensor> colours, masks;

@@ -245,9 +245,10 @@ TEST(Observation, NothingInTheBoundsThrows) {
 }
 
 TEST(ObservedPixels, AreThoseWhosePointsLieInAnObservedToken) {
-  std::vector<View> views = roomViews();
-  const View other = views.back();
-  views.pop_back();
+  const View& other = roomViews()[0];
+  std::vector<View> views = {other};  // of which the right half saw nothing
+  for (size_t i = 0; i < other.depth.size(); ++i)
+    if (i % size_t(other.camera.width) >= size_t(other.camera.width) / 2) views[0].depth[i] = 0;
   const VoxelFrame frame = fittedFrame(views, .1f);
   const Observation o = observed(views, frame, 4);
   const auto size = size_t(other.camera.width) * size_t(other.camera.height);
