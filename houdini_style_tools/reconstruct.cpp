@@ -8,6 +8,7 @@
 #include <cstring>
 #include <random>
 
+#include "encoder/network.h"
 #include "examples/rooms/rooms.h"
 #include "houdini_style_tools/scores.h"
 #include "splat/metrics.h"
@@ -87,14 +88,14 @@ void writeColumns(const std::vector<std::vector<Image>>& columns, const std::str
 }
 
 template <typename T>
-at::Tensor parameterOf(const std::vector<T>& values, at::IntArrayRef shape) {
-  at::Tensor t = torch::empty(shape);
+Tensor parameterOf(const std::vector<T>& values, at::IntArrayRef shape) {
+  Tensor t = torch::empty(shape);
   std::memcpy(t.data_ptr<float>(), values.data(), t.nbytes());
   return t.requires_grad_();
 }
 
 template <typename T>
-void copyBack(const at::Tensor& from, std::vector<T>* to) {
+void copyBack(const Tensor& from, std::vector<T>* to) {
   std::memcpy(static_cast<void*>(to->data()), from.data_ptr<float>(), from.nbytes());
 }
 
@@ -117,20 +118,18 @@ std::vector<ReconstructionResult> meanReconstructions(const std::vector<Reconstr
   return meanScores(results, kScores);
 }
 
-Gaussians voxelMean(const Observation& o, int per_axis) {
+Gaussians voxelMean(const Observation& o, int per_voxel) {
+  const Tensor lattice = subLattice(per_voxel).contiguous();
+  const Eigen::Map<const Eigen::Matrix3Xf> place(lattice.data_ptr<float>(), 3, per_voxel);
+  const double sigma_m = .5 * o.frame.voxel_m / std::cbrt(double(per_voxel));
   Gaussians g;
   for (int64_t v = 0; v < o.tokens.size(0); ++v) {
     const Coord ijk = o.tokens.coords(0)[size_t(v)];
     const float* features = &o.voxel_features[size_t(v) * kVoxelFeatures];
     const Eigen::Vector3f srgb(features[32], features[33], features[34]);
-    for (int i = 0; i < per_axis * per_axis * per_axis; ++i) {
-      const Eigen::Vector3d cell(i / (per_axis * per_axis), i / per_axis % per_axis, i % per_axis);
-      const Eigen::Vector3d index = ijk.asVec3d().x() * Eigen::Vector3d::UnitX() +
-                                    ijk.asVec3d().y() * Eigen::Vector3d::UnitY() +
-                                    ijk.asVec3d().z() * Eigen::Vector3d::UnitZ() +
-                                    (cell.array() + .5).matrix() / per_axis;
-      addIsotropic(o.frame.toWorld(index), .5 * o.frame.voxel_m / per_axis, srgb, &g);
-    }
+    for (int i = 0; i < per_voxel; ++i)
+      addIsotropic(o.frame.toWorld(Eigen::Vector3d(ijk.x(), ijk.y(), ijk.z()) + place.col(i).cast<double>()), sigma_m,
+                   srgb, &g);
   }
   return g;
 }
@@ -159,21 +158,21 @@ Gaussians optimised(const Gaussians& start, const std::vector<View>& views, cons
                     const OptimiseSettings& s, Progress& progress) {
   const auto started = Clock::now();
   const int64_t n = start.size();
-  at::Tensor mean = parameterOf(start.mean, {n, 3}), log_scale = parameterOf(start.log_scale, {n, 3});
-  at::Tensor rotation = parameterOf(start.rotation, {n, 4}), opacity = parameterOf(start.opacity_logit, {n});
-  at::Tensor sh = parameterOf(start.sh, {n, start.shCoefficients(), 3});
+  Tensor mean = parameterOf(start.mean, {n, 3}), log_scale = parameterOf(start.log_scale, {n, 3});
+  Tensor rotation = parameterOf(start.rotation, {n, 4}), opacity = parameterOf(start.opacity_logit, {n});
+  Tensor sh = parameterOf(start.sh, {n, start.shCoefficients(), 3});
   std::vector<torch::optim::OptimizerParamGroup> groups;
-  auto add = [&](const at::Tensor& parameter, double rate) {
-    groups.emplace_back(std::vector<at::Tensor>{parameter},
+  auto add = [&](const Tensor& parameter, double rate) {
+    groups.emplace_back(std::vector<Tensor>{parameter},
                         std::make_unique<torch::optim::AdamOptions>(torch::optim::AdamOptions(rate).eps(1e-15)));
   };
-  // In the proportions of 3-D Gaussian splatting (Kerbl et al. 2023), about four times as fast: half a minute on
+  // In the proportions of 3-D Gaussian splatting (Kerbl et al. 2023), about four times as fast (opacity: as fast): half a minute on
   // two cores is a few hundred steps. Of factors .3, 1 and 2, and of means at 1, 2 and 3 mm, these did best on
   // validation rooms 900000 and 900001.
   add(mean, 2e-3), add(log_scale, 2e-2), add(rotation, 4e-3), add(opacity, 5e-2), add(sh, 1e-2);
   torch::optim::Adam adam(groups, torch::optim::AdamOptions());
 
-  std::vector<at::Tensor> colours, masks;
+  std::vector<Tensor> colours, masks;
   for (size_t i = 0; i < views.size(); ++i) {
     const int64_t h = views[i].camera.height, w = views[i].camera.width;
     colours.push_back(torch::tensor(views[i].colour.data).view({h, w, 3}));
@@ -184,7 +183,7 @@ Gaussians optimised(const Gaussians& start, const std::vector<View>& views, cons
   raster.antialias = start.antialias;
   for (int64_t step = 0; step < s.max_steps && secondsSince(started) < s.seconds; ++step) {
     const size_t i = random() % views.size();
-    const at::Tensor image =
+    const Tensor image =
         rasterizeTorch(mean, log_scale, rotation, opacity, sh, views[i].camera, raster).slice(2, 0, 3);
     adam.zero_grad();
     (((image - colours[i]).square() * masks[i]).sum() / (3 * masks[i].sum()).clamp_min(1)).backward();
@@ -275,7 +274,7 @@ std::vector<ReconstructionResult> evaluateReconstruction(const EvaluationScene& 
     ours.leak = sceneLeak(scene, o.frame, decoded.voxels);
     start = Clock::now();
   }
-  const Gaussians means = voxelMean(o, encoder.config().gaussians_per_axis);
+  const Gaussians means = voxelMean(o, encoder.config().gaussians_per_voxel);
   ReconstructionResult& voxel_mean = measure("voxel-mean", means, observe_seconds + secondsSince(start));
   if (scene.truth) voxel_mean.leak = sceneLeak(scene, o.frame, o.tokens.coords(0));
   start = Clock::now();

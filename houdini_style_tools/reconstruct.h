@@ -1,6 +1,6 @@
 #pragma once
 // What the encoder-decoder makes of the views it is given, without completion, beside Gaussians that need no
-// network (spec sec. 3's reconstruction).
+// network.
 #include <cstdint>
 #include <string>
 #include <vector>
@@ -31,9 +31,9 @@ std::string reconstructionJson(const ReconstructionResult& result);
 /// Mean over scenes of each method, scene "mean"; values that are NaN in a scene are left out there.
 std::vector<ReconstructionResult> meanReconstructions(const std::vector<ReconstructionResult>& results);
 
-/// per_axis^3 opaque Gaussians in each observed voxel, on the decoder's sub-lattice, sigma half a sub-cell,
-/// of the mean colour of the voxel's pixels. World frame.
-Gaussians voxelMean(const Observation& observation, int per_axis);
+/// per_voxel (M) opaque Gaussians in each observed voxel, on the decoder's sub-lattice, sigma half a voxel
+/// divided by the cube root of M, of the mean colour of the voxel's pixels. World frame.
+Gaussians voxelMean(const Observation& observation, int per_voxel);
 
 /// An opaque isotropic Gaussian at each pixel with a nonzero `observed` ([H * W] of each view), at its depth,
 /// as wide as its pixel. World frame.

@@ -50,7 +50,7 @@ TEST(Reconstruct, VoxelMeanOfOneColourHasThatColour) {
   for (View& v : views)
     for (size_t i = 0; i < v.colour.data.size(); ++i) v.colour.data[i] = colour[i % 3];
   const Place place = placeOf(std::move(views));
-  const Gaussians g = voxelMean(place.observation, 2);
+  const Gaussians g = voxelMean(place.observation, 8);
   ASSERT_EQ(g.size(), 8 * place.observation.tokens.size(0));
   for (size_t i = 0; i < g.sh.size(); ++i) ASSERT_NEAR(.5f + kSh0 * g.sh[i], colour[i % 3], 1e-5);
   EXPECT_GT(meanPsnr(g, place), 30);
@@ -58,7 +58,7 @@ TEST(Reconstruct, VoxelMeanOfOneColourHasThatColour) {
 
 TEST(Reconstruct, VoxelMeanLiesOnTheSubLattice) {
   const Observation& o = simplePlace().observation;
-  const Gaussians g = voxelMean(o, 3);
+  const Gaussians g = voxelMean(o, 27);
   for (size_t i = 0; i < g.mean.size(); ++i) {
     const Eigen::Vector3d index = o.frame.toIndex(g.mean[i].cast<double>());
     const Coord voxel = o.tokens.coords(0)[i / 27];
@@ -77,12 +77,12 @@ TEST(Reconstruct, PixelAlignedReproducesTheInput) {
   int64_t pixels = 0;
   for (const auto& mask : place.observed) pixels += std::count(mask.begin(), mask.end(), 1);
   EXPECT_EQ(all.size(), pixels);
-  EXPECT_GT(meanPsnr(all, place), meanPsnr(voxelMean(place.observation, 2), place) + 2);
+  EXPECT_GT(meanPsnr(all, place), meanPsnr(voxelMean(place.observation, 8), place) + 2);
 }
 
 TEST(Reconstruct, OptimisingBeatsItsStart) {
   const Place& place = simplePlace();
-  const Gaussians start = voxelMean(place.observation, 2);
+  const Gaussians start = voxelMean(place.observation, 8);
   OptimiseSettings settings;
   settings.seconds = 1e9, settings.max_steps = 40;
   Progress silent;
