@@ -34,17 +34,8 @@ Target makeTarget(const View& view, const Observation& o, int levels, const Carv
   t.camera = view.camera;
   t.camera.world_from_camera = o.frame.world_from_grid.inverse() * view.camera.world_from_camera;
   t.colour = torch::tensor(view.colour.data).view({view.camera.height, view.camera.width, 3});
-  t.mask = torch::zeros({view.camera.height, view.camera.width, 1});
-  const std::vector<float> depth = usableDepth(view.depthView(), carving);
-  float* mask = t.mask.data_ptr<float>();
-  for (int y = 0; y < view.camera.height; ++y)
-    for (int x = 0; x < view.camera.width; ++x) {
-      const size_t i = size_t(y) * size_t(view.camera.width) + size_t(x);
-      if (depth[i] <= 0) continue;
-      const Eigen::Vector3d p = o.frame.toIndex(view.camera.unproject(x + .5, y + .5, depth[i]));
-      const Coord ijk(int(std::floor(p.x())), int(std::floor(p.y())), int(std::floor(p.z())));
-      mask[i] = o.tokens.row(levels, tokenCoord(ijk, levels)) >= 0;
-    }
+  t.mask = torch::tensor(observedPixels(view, o, levels, carving)).to(torch::kFloat32)
+               .view({view.camera.height, view.camera.width, 1});
   return t;
 }
 

@@ -23,13 +23,13 @@ run() {
   for change in "$@"; do sets="$sets --set $change"; done
   echo "$name" >&2
   # shellcheck disable=SC2086  # one word each
-  "$program" train encoder -o "$out" --cache "$folder/rooms" --rooms 120 --steps "$steps" --threads 1 --seed "$seed" \
+  "$program" train encoder -o "$out" --cache "$folder/rooms" --rooms 120 --steps "$steps" --rate 2e-3 --threads 1 --seed "$seed" \
     $resume $sets >"$out.txt" 2>"$out.err"
 }
 
 run base 1
 run unguided 1 guide_alpha=1
-run m8 1 gaussians_per_voxel=8
+run m27 1 gaussians_per_voxel=27
 run dim32 1 latent_dim=32
 run beta1e-2 1 kl_weight=1e-2
 run unguided 2 guide_alpha=1

@@ -572,7 +572,7 @@ void addEvaluate(CLI::App* verb, Evaluate* o, Complete* options) {
                                                                kReconstructionViews, " with --reconstruct]"))
                     ->check(CLI::Range(1, 1000));
   verb->add_option("--frames", o->frames, "input frames of a folder [--views random ones]");
-  verb->add_option("--weights", o->weights, "folder with encoder.safetensors and completer.safetensors");
+  addWeights(verb, &o->weights);
   verb->add_option("--lpips", o->lpips, "your TorchScript network of two pictures [none]");
   verb->add_option("--features", o->features, "your TorchScript network of one picture, for FID and KID [none]");
   addCompletion(verb, options);

@@ -196,7 +196,7 @@ TEST(OccupancyHead, IsThreeLinearLayersWithOneLogit) {  // A6
   OccupancyHead head(20);
   EXPECT_EQ(parameterCount(head), 2 * (20 * 20 + 20) + 20 + 1);
   const Tensor h = torch::randn({7, 20});
-  const auto layer = [](const Tensor& x, const torch::nn::Linear& l) {
+  const auto layer = [](const Tensor& x, const Linear& l) {
     return torch::matmul(x, l->weight.t()) + l->bias;
   };
   const auto gelu = [](const Tensor& x) { return x * .5 * (1 + torch::erf(x / std::sqrt(2.))); };
