@@ -1,17 +1,20 @@
 #!/bin/sh
-# The encoder-decoder's curves (docs/accuracy.md): a short training for each line of the table below, then its time and
-# quality on held-out rooms, then charts. Can be stopped and started again: finished runs stay, a begun one goes on.
+# The encoder-decoder's curves (docs/accuracy.md): a short training for each `run` line below, its time on a few held-out
+# rooms, then charts. Can be stopped and started again: finished runs stay, a begun one goes on. One core, some three
+# minutes a run; the charts show what is there. The last part needs gnuplot.
 #   sh examples/ablations.sh [FOLDER for runs and rooms, default out/ablations] [STEPS, default 400]
+# CHARTS_ONLY=1 trains nothing.
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
 folder=${1:-$root/out/ablations}
 steps=${2:-400}
 program=${VDB_COMPLETE:-$root/build/release/vdb_complete}
-results=$root/docs/results/ablations.csv
+results=$root/docs/results
 mkdir -p "$folder/runs"
 
 # run NAME SEED [SET...]: trains, validates on 12 held-out rooms on the way.
 run() {
+  if [ -n "${CHARTS_ONLY:-}" ]; then return; fi
   name=$1-s$2 seed=$2
   shift 2
   out=$folder/runs/$name.safetensors
@@ -53,3 +56,85 @@ run levels2-fp0 1 levels=2 false_positives=0
 run levels2-fp100 1 levels=2 false_positives=1.0
 run voxel5cm 1 voxel_m=0.05
 run guided-log 1 guide_log_counts=true
+
+# Time and quality of inference, four views in, on four validation rooms (never trained on).
+for weights in "$folder"/runs/*.safetensors; do
+  log=$weights.work/log.csv
+  if [ ! -f "$log" ] || [ "$(tail -n 1 "$log" | cut -d, -f1)" != "$steps" ] || [ -s "$weights.json" ]; then continue; fi
+  mkdir -p "$folder/weights"
+  cp "$weights" "$folder/weights/encoder.safetensors"
+  for room in 900000 900001 900002 900003; do
+    "$program" eval --reconstruct --optimise 0 --views 4 --scenes "$folder/rooms/$room" --weights "$folder/weights" --threads 1 --json \
+      2>>"$folder/eval.err" | grep '"reconstructed"' | grep -v '"mean"'
+  done >"$weights.json"
+done
+
+echo "run,step,input_psnr,novel_psnr" >"$results/ablations.csv"
+echo "run,seconds,other_psnr,gaussians" >"$results/ablations_time.csv"
+for weights in "$folder"/runs/*.safetensors; do
+  name=$(basename "$weights" .safetensors)
+  log=$weights.work/log.csv
+  [ "$(tail -n 1 "$log" | cut -d, -f1)" = "$steps" ] || continue
+  awk -F, -v name="$name" 'NR == 1 { for (i = 1; i <= NF; ++i) at[$i] = i; next }
+    { print name "," $1 "," $at["input_psnr"] "," $at["novel_psnr"] }' "$log" >>"$results/ablations.csv"
+  awk -v name="$name" 'function value(key,   text) {
+      match($0, "\"" key "\":[-0-9.e+]+"); text = substr($0, RSTART, RLENGTH); sub(".*:", "", text); return text + 0 }
+    { n++; s += value("encode_seconds") + value("decode_seconds"); p += value("other_psnr"); g += value("gaussians") }
+    END { if (n) print name "," s / n "," p / n "," g / n }' "$weights.json" >>"$results/ablations_time.csv"
+done
+
+# psnr RUN: held-out views at the last step.
+psnr() { awk -F, -v run="$1-s1" '$1 == run { last = $4 } END { print last == "" ? "NaN" : last }' "$results/ablations.csv"; }
+data=$folder/charts
+mkdir -p "$data"
+for run in base-s1 base-s2 unguided-s1 unguided-s2; do
+  awk -F, -v run="$run" '$1 == run { print $2, $4 }' "$results/ablations.csv" >"$data/$run"
+done
+printf '1 %s\n8 %s\n27 %s\n64 %s\n' "$(psnr m1)" "$(psnr base)" "$(psnr m27)" "$(psnr m64)" >"$data/m"
+printf '8 16\n27 22.3\n64 27.7\n125 29.5\n216 31.2\n343 31.6\n512 31.9\n' >"$data/m-paper"
+printf '0 %s\n.25 %s\n1 %s\n' "$(psnr fp0)" "$(psnr base)" "$(psnr fp100)" >"$data/fp8"
+printf '0 %s\n.25 %s\n1 %s\n' "$(psnr levels2-fp0)" "$(psnr levels2)" "$(psnr levels2-fp100)" >"$data/fp64"
+printf '0 28\n.1 29\n.2 30\n.3 30.8\n.35 31\n.4 31\n.5 31\n.6 29.2\n.7 27.4\n' >"$data/fp8-paper"
+printf '0 24\n.1 25.2\n.2 26.6\n.25 27\n.3 27\n.4 27\n.5 27\n.6 25.2\n.7 23.4\n' >"$data/fp64-paper"
+printf '16 %s\n32 %s\n64 %s\n128 %s\n' "$(psnr dim16)" "$(psnr dim32)" "$(psnr base)" "$(psnr dim128)" >"$data/dim"
+printf '1e-4 %s\n1e-3 %s\n1e-2 %s\n1e-1 %s\n' "$(psnr base)" "$(psnr beta1e-3)" "$(psnr beta1e-2)" "$(psnr beta1e-1)" >"$data/beta"
+tail -n +2 "$results/ablations_time.csv" | grep -- '-s1,' | grep -v -e beta -e fp -e unguided -e guided | sed 's/-s1,/,/; s/^base,/small,/' >"$data/time"
+paper_guided='20 17.1\n50 22\n100 24.3\n200 25.44\n400 27.1\n600 27.5\n800 28.5\n900 29\n1000 29.5'
+paper_unguided='20 16\n50 17.2\n100 21.1\n200 22.3\n400 24.2\n600 24.4\n800 24.1\n900 24.9\n1000 24.5'
+printf "$paper_guided\n" >"$data/guided-paper"
+printf "$paper_unguided\n" >"$data/unguided-paper"
+cd "$data"
+gnuplot <<'PLOT'
+set terminal svg size 1350,1000 font "sans,13" background "white"
+set output "charts.svg"
+set multiplot layout 3,3
+set grid
+set datafile missing "NaN"
+set style data linespoints
+set key bottom right
+set ylabel "PSNR, views not among the input [dB]"
+set title "Guided attention"; set xlabel "steps"
+plot "base-s1" lw 2 lc 1 t "guided", "base-s2" lw 2 lc 1 dt 2 t "seed 2", "unguided-s1" lw 2 lc 2 t "learned only", "unguided-s2" lw 2 lc 2 dt 2 t "seed 2"
+set title "Guided attention (paper)"; set xlabel "thousand steps"
+plot "guided-paper" lw 2 lc 1 t "guided", "unguided-paper" lw 2 lc 2 t "learned only"
+set key top right font ",10"
+set title "Time and quality"; set xlabel "encode + decode [s], 4 views"
+set datafile separator ","
+plot "time" using 2:3 with points pt 7 notitle, "" using 2:3:1 with labels offset 0,.7 font ",9" notitle
+set datafile separator whitespace
+set key bottom right font ",13"
+set title "Gaussians a voxel"; set xlabel "M"; set logscale x
+plot "m" lw 2 notitle
+set title "Gaussians a voxel (paper)"
+plot "m-paper" lw 2 notitle
+set title "Latent channels"; set xlabel "channels"
+plot "dim" lw 2 notitle
+set title "KL weight"; set xlabel "beta"
+plot "beta" lw 2 notitle
+unset logscale x
+set title "False positives"; set xlabel "share of the truth"
+plot "fp8" lw 2 t "8x", "fp64" lw 2 t "64x"
+set title "False positives (paper)"
+plot "fp8-paper" lw 2 t "8x", "fp64-paper" lw 2 t "64x"
+PLOT
+cp charts.svg "$root/docs/ablations.svg"

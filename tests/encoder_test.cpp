@@ -219,6 +219,18 @@ TEST(EncoderGuide, IsTheSoftmaxOfTheCountsWithoutTheDenseMatrix) {  // E7
   }
 }
 
+TEST(EncoderGuide, MemoryGrowsWithTheCountedPairs) {  // E7: never [N, M]
+  const int64_t n = 3000, m = 50000;
+  for (size_t pairs : {100u, 1000u, 10000u}) {
+    std::vector<int32_t> rows, columns;
+    for (size_t k = 0; k < pairs; ++k) rows.push_back(int32_t(k % n)), columns.push_back(int32_t(k * 7 % m));
+    const CountAttention a = countAttention(rows, columns, std::vector<float>(pairs, 2), n, m, false);
+    size_t bytes = 0;
+    for (const Tensor& t : {a.rows, a.columns, a.weight, a.floor}) bytes += t.storage().nbytes();
+    EXPECT_EQ(bytes, pairs * (8 + 8 + 4) + size_t(n) * 4);
+  }
+}
+
 TEST(EncoderGuide, AlphaOneIsPlainAttentionAndZeroTheGuideAlone) {  // E7
   torch::manual_seed(5);
   Attention attention(24, 2);
@@ -986,6 +998,30 @@ TEST(EncoderTraining, AStepLowersTheLossAtEveryLevel) {  // E8, E13
     EXPECT_TRUE(std::isfinite(before));
     EXPECT_LT(after, before) << levels << " levels";
   }
+}
+
+TEST(EncoderTraining, MixedPrecisionIsCloseToFloatAndEndsWithItsScope) {
+  torch::manual_seed(17);
+  SelfBlock block(32, 2);
+  const Tensor x = torch::randn({40, 32});
+  const auto run = [&] {
+    block.zero_grad();
+    const Tensor y = block.forward(x, nullptr, torch::arange(40), 64, false);
+    y.square().mean().backward();
+    return std::pair(y.detach().clone(), block.mlp->first->weight.grad().clone());
+  };
+  const auto exact = run();
+  const auto mixed = [&] {
+    const MixedPrecision on(true);
+    return run();
+  }();
+  const auto off = [](const Tensor& a, const Tensor& b) { return ((a - b).norm() / b.norm()).item<double>(); };
+  EXPECT_EQ(mixed.first.scalar_type(), torch::kFloat32);
+  EXPECT_EQ(mixed.second.scalar_type(), torch::kFloat32);
+  EXPECT_GT(off(mixed.first, exact.first), 1e-6) << "not in bfloat16";
+  EXPECT_LT(off(mixed.first, exact.first), .01);
+  EXPECT_LT(off(mixed.second, exact.second), .03);
+  EXPECT_TRUE(torch::equal(run().first, exact.first));
 }
 
 TEST(EncoderTraining, PaperPresetRunsAStep) {  // E11, E13: M = 216, width 512
