@@ -15,7 +15,7 @@ EncoderConfig EncoderConfig::paper() {
   c.preset = "paper";
   c.voxel_width = 256, c.width = 512, c.heads = 16;
   c.blocks = 6, c.decoder_blocks = 6, c.window = 1024;
-  c.latent_dim = 32, c.latent_groups = 8, c.kl_weight = .1f;
+  c.kl_weight = .1f;
   c.gaussians_per_voxel = 216;
   return c;
 }

@@ -22,7 +22,7 @@ run() {
   if [ -f "$log" ] && [ "$(tail -n 1 "$log" | cut -d, -f1)" = "$steps" ]; then return; fi
   resume=
   [ -f "$out.work/checkpoint.safetensors" ] && resume=--resume
-  sets=
+  sets="--set latent_dim=64 --set latent_groups=1"  # base; a later --set wins
   for change in "$@"; do sets="$sets --set $change"; done
   echo "$name" >&2
   # shellcheck disable=SC2086  # one word each
