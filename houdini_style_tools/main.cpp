@@ -439,7 +439,11 @@ Config configOf(const Train& t) {
       throw UsageError(joinText("--set: ", change, ": expected a value like ", j[name].dump()));
     j[name] = value;
   }
-  return Config::fromJson(j.dump(), "--set");
+  try {
+    return Config::fromJson(j.dump(), "--set");
+  } catch (const Error& e) {
+    throw UsageError(e.what());
+  }
 }
 
 std::string seedRange(uint64_t first, int64_t count) {

@@ -241,6 +241,8 @@ TEST_F(Program, ValuesThatCannotBeExitWith2) {
   expectFailure(complete(views, {"--tau", "1.5"}), kUsage, "--tau");
   for (const char* frames : {"3-", "2-1", "0,,1", "0;1"})
     expectFailure(complete(views, {std::string("--frames=") + frames}), kUsage, frames);
+  for (const char* change : {"width", "none=1", "width=wide", "width=7"})
+    expectFailure({"train", "encoder", "-o", at("w.safetensors"), "--set", change}, kUsage, "--set");
 }
 
 TEST_F(Program, FramesOutOfRangeNameTheViews) {
