@@ -106,11 +106,10 @@ Observation observeForTraining(const std::vector<View>& views, const EncoderConf
 }
 
 Losses sceneLosses(EncoderNet& net, const std::vector<View>& condition, const std::vector<View>& targets,
-                   bool mixed_precision, torch::Generator& random) {
+                   torch::Generator& random) {
   const EncoderConfig& c = net.config;
   const Observation o = observeForTraining(condition, c);
   const EncoderInput in = encoderInput(condition, o, c);
-  const MixedPrecision mixed(mixed_precision);
   const auto posterior = net.encode(in);
   const Tensor noise = torch::randn(posterior.mean.sizes(), random);
   const Tensor z = net.normalise(posterior.mean + (posterior.log_variance / 2).exp() * noise);
@@ -220,7 +219,8 @@ void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_
       for (size_t i = 0; i < n; ++i) condition.push_back(views[order[i]]);
       for (size_t i = 0; i < std::min<size_t>(n, 2); ++i) targets.push_back(views[order[i]]);
       for (size_t i = n; i < std::min(views.size(), n + 2); ++i) targets.push_back(views[order[i]]);
-      const Losses l = sceneLosses(*net, condition, targets, settings.mixed_precision, random);
+      const MixedPrecision mixed(settings.mixed_precision);
+      const Losses l = sceneLosses(*net, condition, targets, random);
       const Tensor total = l.total(config);
       trainer.addSample(total, {{"loss", total.item<double>()}, {"image", l.image.item<double>()},
                                 {"kl", l.kl.item<double>()}, {"split", l.occupancy.item<double>()}});
@@ -245,7 +245,7 @@ std::pair<double, double> encoderStepLoss(const EncoderConfig& config, const std
   double loss[2];
   for (double& value : loss) {
     torch::Generator random = at::detail::createCPUGenerator(seed);
-    const Tensor total = sceneLosses(*net, views, views, false, random).total(config);
+    const Tensor total = sceneLosses(*net, views, views, random).total(config);
     value = total.item<double>();
     optimiser.zero_grad();
     total.backward();

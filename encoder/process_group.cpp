@@ -24,12 +24,6 @@ std::shared_ptr<gloo::transport::Device> device(const std::string& address) {
   return c10d::ProcessGroupGloo::createDefaultDevice();
 }
 
-// c10 appends its stack.
-std::string firstLine(const std::exception& e) {
-  const std::string text = e.what();
-  return text.substr(0, text.find('\n'));
-}
-
 }  // namespace
 
 ProcessGroup::ProcessGroup(const TrainProcesses& p) : rank_(p.rank), size_(p.size) {

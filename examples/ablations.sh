@@ -99,10 +99,8 @@ printf '0 24\n.1 25.2\n.2 26.6\n.25 27\n.3 27\n.4 27\n.5 27\n.6 25.2\n.7 23.4\n'
 printf '16 %s\n32 %s\n64 %s\n128 %s\n' "$(psnr dim16)" "$(psnr dim32)" "$(psnr base)" "$(psnr dim128)" >"$data/dim"
 printf '1e-4 %s\n1e-3 %s\n1e-2 %s\n1e-1 %s\n' "$(psnr base)" "$(psnr beta1e-3)" "$(psnr beta1e-2)" "$(psnr beta1e-1)" >"$data/beta"
 tail -n +2 "$results/ablations_time.csv" | grep -- '-s1,' | grep -v -e beta -e fp -e unguided -e guided | sed 's/-s1,/,/; s/^base,/small,/' >"$data/time"
-paper_guided='20 17.1\n50 22\n100 24.3\n200 25.44\n400 27.1\n600 27.5\n800 28.5\n900 29\n1000 29.5'
-paper_unguided='20 16\n50 17.2\n100 21.1\n200 22.3\n400 24.2\n600 24.4\n800 24.1\n900 24.9\n1000 24.5'
-printf "$paper_guided\n" >"$data/guided-paper"
-printf "$paper_unguided\n" >"$data/unguided-paper"
+printf '20 17.1\n50 22\n100 24.3\n200 25.44\n400 27.1\n600 27.5\n800 28.5\n900 29\n1000 29.5\n' >"$data/guided-paper"
+printf '20 16\n50 17.2\n100 21.1\n200 22.3\n400 24.2\n600 24.4\n800 24.1\n900 24.9\n1000 24.5\n' >"$data/unguided-paper"
 cd "$data"
 gnuplot <<'PLOT'
 set terminal svg size 1350,1000 font "sans,13" background "white"

@@ -91,12 +91,6 @@ namespace {
 
 constexpr int kTileWidth = 320;
 
-void paste(const Image& from, int x0, int y0, Image* to) {
-  for (int y = 0; y < from.height; ++y)
-    for (int x = 0; x < from.width; ++x)
-      for (int c = 0; c < 3; ++c) to->at(x0 + x, y0 + y, c) = from.at(x, y, c);
-}
-
 // From the mean camera place, four level headings, the first as the first view looks.
 std::vector<Camera> novelCameras(const std::vector<View>& views, const Eigen::Vector3d& up, int width,
                                  int height) {
@@ -129,15 +123,15 @@ Image contactSheet(const std::vector<View>& views, const Completion& completion,
   for (int i = 0; i < shown; ++i) {
     const Camera& c = views[size_t(i)].camera;
     const double shrink = std::min(double(kTileWidth) / c.width, double(height) / c.height);
-    paste(resizeImage(views[size_t(i)].colour, std::max(1, int(c.width * shrink)), std::max(1, int(c.height * shrink))),
+    pasteImage(resizeImage(views[size_t(i)].colour, std::max(1, int(c.width * shrink)), std::max(1, int(c.height * shrink))),
           i * kTileWidth, 0, &sheet);
   }
   const std::vector<Camera> cameras = novelCameras(views, up, kTileWidth, height);
   RasterSettings settings;
   settings.antialias = completion.whole_decoded.gaussians.antialias;
   for (int i = 0; i < columns; ++i) {
-    paste(rasterize(completion.seen_decoded.gaussians, cameras[size_t(i)], settings).colour, i * kTileWidth, height, &sheet);
-    paste(rasterize(completion.whole_decoded.gaussians, cameras[size_t(i)], settings).colour, i * kTileWidth, 2 * height, &sheet);
+    pasteImage(rasterize(completion.seen_decoded.gaussians, cameras[size_t(i)], settings).colour, i * kTileWidth, height, &sheet);
+    pasteImage(rasterize(completion.whole_decoded.gaussians, cameras[size_t(i)], settings).colour, i * kTileWidth, 2 * height, &sheet);
   }
   return sheet;
 }

@@ -152,10 +152,6 @@ ordered_json scaleJson(const Complete& o) {
   return {{"metres_per_unit", s.metres_per_unit}, {"scale_from", s.source}};
 }
 
-double secondsSince(std::chrono::steady_clock::time_point start) {
-  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-}
-
 // One object on stdout, or `text` and the pointmaps' scale.
 void printSummary(bool json, ordered_json summary, const std::string& text,
                   const ordered_json& scale = ordered_json::object()) {
@@ -169,29 +165,40 @@ void printSummary(bool json, ordered_json summary, const std::string& text,
                 scale["metres_per_unit"].get<double>(), scale["scale_from"].get<std::string>().c_str());
 }
 
+// What completing and encoding start from.
+struct SceneInput {
+  std::vector<View> views;
+  Eigen::Vector3d up;
+  SceneSettings settings;
+};
+
+SceneInput readScene(const Complete& o, const Common& common, const ReadViewsSettings& chosen) {
+  std::vector<View> views = readViews(o.views, chosen);
+  const Eigen::Vector3d up = upOf(o);
+  return {std::move(views), up, sceneSettings(o, common, up)};
+}
+
 void cookComplete(const Complete& o, const Common& common, Progress& progress) {
   const ReadViewsSettings chosen = reading(o.frames, o.scale);
   const std::string stem = outputStem(o.output);
   const std::string weights = weightsFolder(o.weights);
   const auto start = std::chrono::steady_clock::now();
   progress.start("read");
-  const std::vector<View> views = readViews(o.views, chosen);
-  const Eigen::Vector3d up = upOf(o);
-  const SceneSettings settings = sceneSettings(o, common, up);
+  const SceneInput in = readScene(o, common, chosen);
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
   progress.end();
-  Completion c = naming(o.views, [&] { return completeScene(views, encoder, completer, settings, progress); });
+  Completion c = naming(o.views, [&] { return completeScene(in.views, encoder, completer, in.settings, progress); });
   for (DecodedGrid* d : {&c.seen_decoded, &c.whole_decoded}) d->gaussians.antialias = o.antialias;
-  writeCompletion(views, c, stem, up, progress);
+  writeCompletion(in.views, c, stem, in.up, progress);
   const double seconds = secondsSince(start);
   const int64_t observed = c.seen.size(), generated = c.whole.size() - observed;
   const size_t voxels = c.whole_decoded.voxels.size();
   const int64_t gaussians = c.whole_decoded.gaussians.size();
   printSummary(common.json,
-               {{"views", views.size()}, {"observed_tokens", observed}, {"generated_tokens", generated},
+               {{"views", in.views.size()}, {"observed_tokens", observed}, {"generated_tokens", generated},
                 {"voxels", voxels}, {"gaussians", gaussians}, {"seconds", seconds}, {"output", stem}},
-               joinText(views.size(), " views: ", observed, " tokens observed, ", generated, " generated; ", voxels,
+               joinText(in.views.size(), " views: ", observed, " tokens observed, ", generated, " generated; ", voxels,
                         " voxels, ", gaussians, " Gaussians; ", std::round(seconds * 10) / 10, " s\n", stem, ".vdb  ",
                         stem, ".points.vdb  ", stem, ".ply  ", stem, ".png"),
                scaleJson(o));
@@ -207,19 +214,17 @@ void cookEncode(const Complete& o, const Common& common, Progress& progress) {
   const std::string weights = weightsFolder(o.weights);
   const auto start = std::chrono::steady_clock::now();
   progress.start("read");
-  const std::vector<View> views = readViews(o.views, chosen);
-  const Eigen::Vector3d up = upOf(o);
-  const SceneSettings settings = sceneSettings(o, common, up);
+  const SceneInput in = readScene(o, common, chosen);
   const Encoder encoder(weights + "/encoder.safetensors");
   progress.end();
-  const Encoding e = naming(o.views, [&] { return encodeScene(views, encoder, settings, progress); });
+  const Encoding e = naming(o.views, [&] { return encodeScene(in.views, encoder, in.settings, progress); });
   progress.start("write");
   writeLatentVdb({e.latents, e.observation.space, encoder.hash()}, o.output);
   progress.end();
   const double seconds = secondsSince(start);
   printSummary(common.json,
-               {{"views", views.size()}, {"tokens", e.latents.size()}, {"seconds", seconds}, {"output", o.output}},
-               joinText(views.size(), " views: ", e.latents.size(), " tokens; ", std::round(seconds * 10) / 10, " s\n",
+               {{"views", in.views.size()}, {"tokens", e.latents.size()}, {"seconds", seconds}, {"output", o.output}},
+               joinText(in.views.size(), " views: ", e.latents.size(), " tokens; ", std::round(seconds * 10) / 10, " s\n",
                         o.output),
                scaleJson(o));
 }
@@ -713,8 +718,7 @@ int main(int argc, char** argv) {
     std::fprintf(stderr, "vdb_complete: %s\n", e.what());
     return 2;
   } catch (const std::exception& e) {
-    const std::string text = e.what();  // torch appends its stack
-    std::fprintf(stderr, "vdb_complete: %s\n", text.substr(0, text.find('\n')).c_str());
+    std::fprintf(stderr, "vdb_complete: %s\n", vdbc::firstLine(e).c_str());
     return 1;
   }
 }

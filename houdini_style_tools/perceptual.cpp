@@ -12,13 +12,6 @@
 namespace vdbc {
 namespace {
 
-/// torch's messages append its stack: the first line that says something.
-std::string firstLine(const std::exception& error) {
-  const std::string text = error.what();
-  const size_t begin = std::min(text.find_first_not_of("\n "), text.size());
-  return text.substr(begin, text.find('\n', begin) - begin);
-}
-
 at::Tensor tensorOf(const Image& image) {
   at::Tensor t = at::empty({1, 3, image.height, image.width});
   float* to = t.data_ptr<float>();

@@ -78,12 +78,8 @@ void writeColumns(const std::vector<std::vector<Image>>& columns, const std::str
   const int width = columns[0][0].width, height = columns[0][0].height;
   Image sheet(width * int(columns.size()), height * int(columns[0].size()), 3);
   for (size_t c = 0; c < columns.size(); ++c)
-    for (size_t r = 0; r < columns[c].size(); ++r) {
-      const Image tile = resizeImage(columns[c][r], width, height);
-      for (int y = 0; y < height; ++y)
-        std::copy_n(&tile.data[size_t(y) * size_t(width) * 3], size_t(width) * 3,
-                    &sheet.at(int(c) * width, int(r) * height + y, 0));
-    }
+    for (size_t r = 0; r < columns[c].size(); ++r)
+      pasteImage(resizeImage(columns[c][r], width, height), int(c) * width, int(r) * height, &sheet);
   writePng(sheet, path);
 }
 

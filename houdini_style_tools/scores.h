@@ -2,7 +2,6 @@
 // Private: what all evaluations share. Results are plain structs with `scene`, `method`, `views`,
 // `gaussians` and numbers; one list of a result's numbers serves JSON and means.
 #include <algorithm>
-#include <chrono>
 #include <cmath>
 #include <cstdlib>
 #include <fstream>
@@ -10,6 +9,8 @@
 #include <nlohmann/json.hpp>
 #include <string>
 #include <vector>
+
+#include "vdb/progress.h"
 
 namespace vdbc {
 
@@ -55,10 +56,6 @@ std::vector<Result> meanScores(const std::vector<Result>& results, const std::ve
     means.push_back(mean);
   }
   return means;
-}
-
-inline double secondsSince(std::chrono::steady_clock::time_point start) {
-  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
 }
 
 // The kernel keeps the peak; writing 5 to clear_refs starts it afresh (Linux).

@@ -353,6 +353,7 @@ void trainCompleter(const CompleterConfig& config, const SampleSource& samples, 
     next = std::async(std::launch::async, load, first + settings.batch);
     for (size_t k = 0; k < current.size(); ++k) {
       torch::Generator random = at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(first) + k);
+      const MixedPrecision mixed(settings.mixed_precision);
       const Losses l = sampleLosses(*net, current[k], random);
       const Tensor total = l.total();
       trainer.addSample(total, {{"loss", total.item<double>()}, {"coarse", l.coarse.item<double>()},

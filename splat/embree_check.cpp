@@ -9,16 +9,12 @@
 #include <limits>
 #include <random>
 
+#include "splat/embree_device.h"
 #include "vdb/error.h"
 
 namespace vdbc {
-namespace {
 
-constexpr float kInfinity = std::numeric_limits<float>::infinity();
-
-// One device for the process: making one costs milliseconds and it holds no scene data. Scenes keep
-// a reference to their device, so the order of destruction at exit does not matter.
-RTCDevice device() {
+RTCDevice embreeDevice() {
   static const struct Holder {
     RTCDevice device = rtcNewDevice(nullptr);
     ~Holder() { rtcReleaseDevice(device); }
@@ -26,6 +22,10 @@ RTCDevice device() {
   require(holder.device != nullptr, "Embree: cannot create a device");
   return holder.device;
 }
+
+namespace {
+
+constexpr float kInfinity = std::numeric_limits<float>::infinity();
 
 struct VoxelBox {
   Eigen::Vector3f min;  // index space; the box is [min, min + 1]
@@ -137,7 +137,7 @@ struct RayTarget::Impl {
   std::vector<VoxelBox> boxes;
   std::vector<Ellipsoid> ellipsoids;
 
-  Impl() : scene(rtcNewScene(device())) {
+  Impl() : scene(rtcNewScene(embreeDevice())) {
     // Robust: rays must not slip through the edge shared by two triangles.
     rtcSetSceneFlags(scene, RTC_SCENE_FLAG_ROBUST);
     rtcSetSceneBuildQuality(scene, RTC_BUILD_QUALITY_MEDIUM);
@@ -148,7 +148,7 @@ struct RayTarget::Impl {
 
   template <typename Solid>
   void attachSolids(std::vector<Solid>& solids) {
-    RTCGeometry geometry = rtcNewGeometry(device(), RTC_GEOMETRY_TYPE_USER);
+    RTCGeometry geometry = rtcNewGeometry(embreeDevice(), RTC_GEOMETRY_TYPE_USER);
     rtcSetGeometryUserPrimitiveCount(geometry, unsigned(solids.size()));
     rtcSetGeometryUserData(geometry, solids.data());
     rtcSetGeometryBoundsFunction(geometry, boundsCallback<Solid>, nullptr);
@@ -174,7 +174,7 @@ RayTarget RayTarget::fromMesh(const TriangleMesh& mesh) {
     require(t.minCoeff() >= 0 && t.maxCoeff() < vertex_count, "RayTarget: a triangle names vertex ",
             t.minCoeff() < 0 ? t.minCoeff() : t.maxCoeff(), ", expected 0 to ", vertex_count - 1);
   auto impl = std::make_unique<Impl>();
-  RTCGeometry geometry = rtcNewGeometry(device(), RTC_GEOMETRY_TYPE_TRIANGLE);
+  RTCGeometry geometry = rtcNewGeometry(embreeDevice(), RTC_GEOMETRY_TYPE_TRIANGLE);
   // Embree's own buffers are padded for its vector loads; empty ones cannot be made.
   if (!mesh.triangles.empty()) {
     auto* vertices = static_cast<Eigen::Vector3f*>(

@@ -455,6 +455,17 @@ Image resizeImage(const Image& image, int width, int height) {
   return result;
 }
 
+void pasteImage(const Image& from, int x, int y, Image* to) {
+  requireImage("pasteImage", from);
+  require(x >= 0 && y >= 0 && x + from.width <= to->width && y + from.height <= to->height &&
+              from.channels == to->channels,
+          "pasteImage: ", from.width, " x ", from.height, " x ", from.channels, " at ", x, ", ", y,
+          " does not fit ", to->width, " x ", to->height, " x ", to->channels);
+  const size_t row = size_t(from.width) * size_t(from.channels);
+  for (int i = 0; i < from.height; ++i)
+    std::copy_n(&from.data[size_t(i) * row], row, &to->at(x, y + i, 0));
+}
+
 double psnr(const Image& a, const Image& b) {
   requireSameSize("psnr", a, b);
   const size_t row = size_t(a.width) * size_t(a.channels);

@@ -39,6 +39,9 @@ void writePng16(const std::vector<uint16_t>& data, int width, int height, const 
 /// Area-averaging when shrinking, bilinear when growing.
 Image resizeImage(const Image& image, int width, int height);
 
+/// Writes `from` over the pixels of `to` from (x, y) on; it must fit and have as many channels.
+void pasteImage(const Image& from, int x, int y, Image* to);
+
 /// 10 log10(1 / mean squared error) over all values; infinity for equal images. Values are 0-1.
 double psnr(const Image& a, const Image& b);
 /// SSIM of each window and channel (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, K1 .01,

@@ -1039,14 +1039,16 @@ class StopAtHalf : public Progress {
 
 class EncoderResume : public InFolder {};
 
+/// Four views of one room, others for each index.
+std::vector<View> rotatedViews(uint64_t index) {
+  std::vector<View> views = roomViews(8);
+  std::rotate(views.begin(), views.begin() + std::ptrdiff_t(index % 8), views.end());
+  views.resize(4);
+  return views;
+}
+
 TEST_F(EncoderResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // E13
   const EncoderConfig c = toyConfig();
-  const SceneSource scenes = [](uint64_t index) {
-    std::vector<View> views = roomViews(8);
-    std::rotate(views.begin(), views.begin() + std::ptrdiff_t(index % 8), views.end());
-    views.resize(4);
-    return views;
-  };
   const SceneSource validation = [](uint64_t) { return roomViews(6); };
   TrainSettings settings;
   settings.steps = 6, settings.warmup = 2, settings.validate_every = settings.checkpoint_every = 3;
@@ -1056,7 +1058,7 @@ TEST_F(EncoderResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // E13
     settings.resume = resume;
     std::vector<TrainLogRow> rows;
     trainEncoder(
-        c, scenes, 5, validation, 1, settings, [&](const TrainLogRow& row) { rows.push_back(row); },
+        c, rotatedViews, 5, validation, 1, settings, [&](const TrainLogRow& row) { rows.push_back(row); },
         progress);
     return rows;
   };
@@ -1078,22 +1080,16 @@ TEST_F(EncoderResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // E13
   settings.resume = true;
   EncoderConfig other = c;
   other.kl_weight = .5f;
-  EXPECT_THROW(trainEncoder(other, scenes, 5, validation, 0, settings, nullptr, silent), Error);
+  EXPECT_THROW(trainEncoder(other, rotatedViews, 5, validation, 0, settings, nullptr, silent), Error);
 }
 
 /// Trains a toy network on rotations of one room's views and returns the log.
 std::vector<TrainLogRow> trainToy(TrainSettings settings, const std::string& folder) {
   settings.steps = 4, settings.warmup = 1, settings.validate_every = 1, settings.batch = 2;
   settings.weights_path = folder + "/w.safetensors", settings.work_folder = folder + "/work";
-  const SceneSource scenes = [](uint64_t index) {
-    std::vector<View> views = roomViews(8);
-    std::rotate(views.begin(), views.begin() + std::ptrdiff_t(index % 8), views.end());
-    views.resize(4);
-    return views;
-  };
   std::vector<TrainLogRow> rows;
   Progress silent;
-  trainEncoder(toyConfig(), scenes, 5, [](uint64_t) { return roomViews(6); }, 1, settings,
+  trainEncoder(toyConfig(), rotatedViews, 5, [](uint64_t) { return roomViews(6); }, 1, settings,
                [&](const TrainLogRow& row) { rows.push_back(row); }, silent);
   return rows;
 }

@@ -12,7 +12,7 @@
 #include <random>
 #include <set>
 
-#include "tests/files.h"
+#include "tests/vdb_files.h"
 #include "vdb/grid_instances.h"
 
 namespace vdbc {
@@ -144,56 +144,24 @@ TEST(LatentVdb, OnePointAtEachNodesCentre) {
   EXPECT_EQ(grid->metaValue<int64_t>("point_count"), file.latents.size());
 }
 
-constexpr size_t kTrailerBytes = 16;
 
 TEST(LatentVdb, EveryTruncationThrows) {
   const TemporaryFolder folder;
   writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");
-  const std::string bytes = bytesOf(folder / "a.vdb");
-  ASSERT_GT(bytes.size(), 1000u);
-  const size_t grids = bytes.size() - kTrailerBytes;
-  for (size_t n = 0; n < grids; n += n < 300 || n + 8 > grids ? 1 : 53) {
-    writeBytes(folder / "cut.vdb", bytes.substr(0, n));
-    EXPECT_THROW(readLatentVdb(folder / "cut.vdb"), Error) << n << " of " << bytes.size();
-  }
+  expectEveryTruncationThrows(folder / "a.vdb", folder / "cut.vdb", 53, readLatentVdb);
 }
 
 TEST(LatentVdb, EveryCorruptionThrows) {
   const TemporaryFolder folder;
   writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");
-  const std::string bytes = bytesOf(folder / "a.vdb");
-  std::mt19937 random(4);
-  for (int i = 0; i < 300; ++i) {
-    std::string bad = bytes;
-    const size_t at = random() % (bad.size() - kTrailerBytes);
-    bad[at] = char(bad[at] ^ (1 << i % 8));
-    writeBytes(folder / "bad.vdb", bad);
-    EXPECT_THROW(readLatentVdb(folder / "bad.vdb"), Error) << "byte " << at;
-  }
-}
-
-using Grids = std::map<std::string, openvdb::GridBase::Ptr>;
-
-/// The file as another program would write it again after `change`.
-template <typename Change>
-void rewrite(const std::string& from, const std::string& to, Change change) {
-  openvdb::io::File file(from);
-  file.open(false);
-  openvdb::MetaMap metadata = *file.getMetadata();
-  const openvdb::GridPtrVecPtr grids = file.getGrids();
-  Grids by_name;
-  for (const auto& grid : *grids) by_name[grid->getName()] = grid;
-  change(by_name, metadata);
-  openvdb::GridPtrVec changed;
-  for (const auto& [name, grid] : by_name) changed.push_back(grid);
-  openvdb::io::File(to).write(changed, metadata);
+  expectEveryCorruptionThrows(folder / "a.vdb", folder / "bad.vdb", readLatentVdb);
 }
 
 TEST(LatentVdb, FilesWrittenAgainByOthersAreRead) {
   const TemporaryFolder folder;
   const LatentFile before = someLatents();
   writeLatentVdb(before, folder / "a.vdb");
-  rewrite(folder / "a.vdb", folder / "b.vdb", [](Grids&, openvdb::MetaMap&) {});
+  rewriteVdb(folder / "a.vdb", folder / "b.vdb", [](Grids&, openvdb::MetaMap&) {});
   expectSame(readLatentVdb(folder / "b.vdb"), before, inHalf(before.latents.z));
 }
 
@@ -202,7 +170,7 @@ TEST(LatentVdb, ForeignFilesWithNonsenseThrow) {
   const TemporaryFolder folder;
   writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");
   const auto rejects = [&](const char* named, auto change) {
-    rewrite(folder / "a.vdb", folder / "b.vdb", change);
+    rewriteVdb(folder / "a.vdb", folder / "b.vdb", change);
     try {
       readLatentVdb(folder / "b.vdb");
       ADD_FAILURE() << "was read: " << named;

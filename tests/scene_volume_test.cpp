@@ -18,7 +18,7 @@
 #include <random>
 #include <set>
 
-#include "tests/files.h"
+#include "tests/vdb_files.h"
 #include "vdb/grid_instances.h"
 
 namespace vdbc {
@@ -446,32 +446,17 @@ SceneVoxels smallScene() {
   frame.bounds = CoordBBox(Coord(0), Coord(11));
   return shellScene(frame, 4.5);
 }
-constexpr size_t kTrailerBytes = 16;
 
 TEST(SceneVdb, EveryTruncationThrows) {
   const TemporaryFolder folder;
   writeSceneVdb(smallScene(), folder / "a.vdb");
-  const std::string bytes = bytesOf(folder / "a.vdb");
-  ASSERT_GT(bytes.size(), 1000u);
-  const size_t grids = bytes.size() - kTrailerBytes;
-  for (size_t n = 0; n < grids; n += n < 300 || n + 8 > grids ? 1 : 307) {
-    writeBytes(folder / "cut.vdb", bytes.substr(0, n));
-    EXPECT_THROW(readSceneVdb(folder / "cut.vdb"), Error) << n << " of " << bytes.size();
-  }
+  expectEveryTruncationThrows(folder / "a.vdb", folder / "cut.vdb", 307, readSceneVdb);
 }
 
 TEST(SceneVdb, EveryCorruptionThrows) {
   const TemporaryFolder folder;
   writeSceneVdb(smallScene(), folder / "a.vdb");
-  const std::string bytes = bytesOf(folder / "a.vdb");
-  std::mt19937 random(4);
-  for (int i = 0; i < 300; ++i) {
-    std::string bad = bytes;
-    const size_t at = random() % (bad.size() - kTrailerBytes);
-    bad[at] = char(bad[at] ^ (1 << i % 8));
-    writeBytes(folder / "bad.vdb", bad);
-    EXPECT_THROW(readSceneVdb(folder / "bad.vdb"), Error) << "byte " << at;
-  }
+  expectEveryCorruptionThrows(folder / "a.vdb", folder / "bad.vdb", readSceneVdb);
 }
 
 TEST(SceneVdb, FilesWrittenAgainByOthersAreRead) {
@@ -488,19 +473,9 @@ TEST(SceneVdb, ForeignFilesWithNonsenseThrow) {
   const TemporaryFolder folder;
   writeSceneVdb(smallScene(), folder / "a.vdb");
   const auto rejects = [&](auto change) {
-    openvdb::io::File file(folder / "a.vdb");
-    file.open(false);
-    const auto grids = file.getGrids();
-    openvdb::MetaMap metadata = *file.getMetadata();
-    std::map<std::string, openvdb::GridBase::Ptr> by_name;
-    for (const auto& grid : *grids) by_name[grid->getName()] = grid;
-    change(by_name, metadata);
-    openvdb::GridPtrVec changed;
-    for (const auto& [name, grid] : by_name) changed.push_back(grid);
-    openvdb::io::File(folder / "b.vdb").write(changed, metadata);
+    rewriteVdb(folder / "a.vdb", folder / "b.vdb", change);
     EXPECT_THROW(readSceneVdb(folder / "b.vdb"), Error);
   };
-  using Grids = std::map<std::string, openvdb::GridBase::Ptr>;
   using openvdb::MetaMap;
   const auto floats = [](Grids& g, const char* name) -> FloatGrid& {
     return *openvdb::gridPtrCast<FloatGrid>(g[name]);

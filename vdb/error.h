@@ -1,6 +1,7 @@
 #pragma once
 // The one error type. Everything that can go wrong with input is thrown as Error, at the door, with
 // one line: operation, object, what was expected, what was found.
+#include <algorithm>
 #include <sstream>
 #include <stdexcept>
 #include <string>
@@ -31,6 +32,13 @@ std::string joinText(const Parts&... parts) {
   std::ostringstream out;
   (out << ... << parts);
   return out.str();
+}
+
+/// The first line of what() that says something: libtorch's exceptions append its stack.
+inline std::string firstLine(const std::exception& error) {
+  const std::string text = error.what();
+  const size_t begin = std::min(text.find_first_not_of("\n "), text.size());
+  return text.substr(begin, text.find('\n', begin) - begin);
 }
 
 /// Throws Error with the joined parts unless `ok`.

@@ -2,6 +2,8 @@
 // One object serves OpenVDB's tools and our own loops: reports progress and asks whether to stop.
 #include <openvdb/util/NullInterrupter.h>
 
+#include <chrono>
+
 #include "vdb/error.h"
 
 namespace vdbc {
@@ -17,6 +19,10 @@ class Progress : public openvdb::util::NullInterrupter {
   /// percent in [0, 100], or -1 where unknown. True: stop as soon as possible.
   bool wasInterrupted(int /*percent*/ = -1) override { return false; }
 };
+
+inline double secondsSince(std::chrono::steady_clock::time_point start) {
+  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+}
 
 /// Reports `percent` and throws Cancelled if the user asked to stop.
 inline void report(Progress& progress, int percent) {

@@ -17,6 +17,7 @@
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
 #include "vdb/file_io.h"
+#include "vdb/progress.h"
 
 namespace vdbc {
 namespace {
@@ -56,16 +57,6 @@ std::vector<uint64_t> seedList(const std::string& text) {
   return seeds;
 }
 
-double secondsSince(std::chrono::steady_clock::time_point start) {
-  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-}
-
-void paste(const Image& from, int x0, int y0, Image* to) {
-  for (int y = 0; y < from.height; ++y)
-    for (int x = 0; x < from.width; ++x)
-      for (int c = 0; c < 3; ++c) to->at(x0 + x, y0 + y, c) = from.at(x, y, c);
-}
-
 // One picture a tile, in rows.
 Image contactSheet(const std::vector<Image>& pictures, int columns) {
   const int count = int(pictures.size());
@@ -73,7 +64,7 @@ Image contactSheet(const std::vector<Image>& pictures, int columns) {
   const int rows = (count + columns - 1) / columns, w = pictures[0].width, h = pictures[0].height;
   Image sheet(columns * w, rows * h, 3, .15f);
   for (int i = 0; i < count; ++i)
-    paste(pictures[size_t(i)], i % columns * w, i / columns * h, &sheet);
+    pasteImage(pictures[size_t(i)], i % columns * w, i / columns * h, &sheet);
   return sheet;
 }
 

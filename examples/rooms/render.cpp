@@ -8,7 +8,6 @@
 // the floor, the ceiling round a lamp. Such spots are sampled like lights from afar (instant
 // radiosity, Keller 1997) and left out of what far bounces bring; nearer than kCacheReach it is the
 // other way round, so that nothing is lost or counted twice, and nothing needs to be clamped.
-#include <embree3/rtcore.h>
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
@@ -22,6 +21,7 @@
 
 #include "examples/rooms/ray_log.h"
 #include "examples/rooms/rooms.h"
+#include "splat/embree_device.h"
 #include "vdb/error.h"
 
 namespace vdbc {
@@ -646,15 +646,6 @@ LightCache::LightCache(const std::vector<Sample>& samples) {
 
 // --- rays ----------------------------------------------------------------------------------------
 
-RTCDevice device() {
-  static const struct Holder {
-    RTCDevice device = rtcNewDevice(nullptr);
-    ~Holder() { rtcReleaseDevice(device); }
-  } holder;
-  require(holder.device != nullptr, "RoomRenderer: Embree cannot create a device");
-  return holder.device;
-}
-
 struct Packet {
   alignas(64) RTCRayHit16 query;
   alignas(64) std::array<int, kPacket> valid;
@@ -730,6 +721,13 @@ struct RoomRenderer::Impl {
     Packet* packet;
     bool only_solid;  // glass is seen through
   };
+  /// What Embree asks its filters about.
+  struct Candidate {
+    int32_t triangle;
+    size_t material;
+    float u, v;
+    unsigned ray;  // in the packet
+  };
 
   SurfaceMesh surface;
   std::vector<std::unique_ptr<MipTexture>> textures;
@@ -765,6 +763,11 @@ struct RoomRenderer::Impl {
 
   void intersect(Packet* packet, bool coherent, bool only_solid) const;
   void occlude(Packet* packet) const;
+  /// Takes those hits away that `rejects(query, hit)`.
+  template <typename Rejects>
+  static void filterHits(const RTCFilterFunctionNArguments* args, const Rejects& rejects);
+  /// The texture has a hole there.
+  bool isCutOut(const Candidate& hit) const;
   static void intersectFilter(const RTCFilterFunctionNArguments* args);
   static void occlusionFilter(const RTCFilterFunctionNArguments* args);
 
@@ -911,9 +914,9 @@ void RoomRenderer::Impl::buildScene() {
     texels_per_metre[i] = std::sqrt(std::abs(p.x() * q.y() - p.y() * q.x()) /
                                     std::max((b - a).cross(c - a).norm(), 1e-12f));
   }
-  scene = rtcNewScene(device());
+  scene = rtcNewScene(embreeDevice());
   for (unsigned g = 0; g < 2; ++g) {
-    RTCGeometry geometry = rtcNewGeometry(device(), RTC_GEOMETRY_TYPE_TRIANGLE);
+    RTCGeometry geometry = rtcNewGeometry(embreeDevice(), RTC_GEOMETRY_TYPE_TRIANGLE);
     rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3,
                                vertices.data(), 0, sizeof(Vector3f), vertex_count);
     rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3,
@@ -927,7 +930,7 @@ void RoomRenderer::Impl::buildScene() {
     rtcReleaseGeometry(geometry);
   }
   rtcCommitScene(scene);
-  const RTCError error = rtcGetDeviceError(device());
+  const RTCError error = rtcGetDeviceError(embreeDevice());
   require(error == RTC_ERROR_NONE, "RoomRenderer: Embree: error ", int(error));
 }
 
@@ -1120,41 +1123,43 @@ void RoomRenderer::Impl::occlude(Packet* packet) const {
   rtcOccluded16(packet->valid.data(), scene, &query.context, &packet->query.ray);
 }
 
-void RoomRenderer::Impl::intersectFilter(const RTCFilterFunctionNArguments* args) {
+template <typename Rejects>
+void RoomRenderer::Impl::filterHits(const RTCFilterFunctionNArguments* args, const Rejects& rejects) {
   const Query& query = *reinterpret_cast<const Query*>(args->context);
   const Impl& self = *query.renderer;
   for (unsigned i = 0; i < args->N; ++i) {
     if (args->valid[i] != -1) continue;
-    const int32_t t = self.triangle[1][RTCHitN_primID(args->hit, args->N, i)];
-    const size_t m = size_t(self.surface.material[size_t(t)]);
-    const MipTexture* texture = self.texture_of[m];
-    if (query.only_solid && self.surface.materials[m].opacity < kSolidOpacity) {
-      args->valid[i] = 0;
-    } else if (texture && texture->hasAlpha()) {
-      const float u = RTCHitN_u(args->hit, args->N, i), v = RTCHitN_v(args->hit, args->N, i);
-      if (texture->coverage(self.uvAt(t, u, v)) < .5f) args->valid[i] = 0;
-    }
+    Candidate hit;
+    hit.triangle = self.triangle[1][RTCHitN_primID(args->hit, args->N, i)];
+    hit.material = size_t(self.surface.material[size_t(hit.triangle)]);
+    hit.u = RTCHitN_u(args->hit, args->N, i), hit.v = RTCHitN_v(args->hit, args->N, i);
+    hit.ray = RTCRayN_id(args->ray, args->N, i);
+    if (rejects(query, hit)) args->valid[i] = 0;
   }
 }
 
+bool RoomRenderer::Impl::isCutOut(const Candidate& hit) const {
+  const MipTexture* texture = texture_of[hit.material];
+  return texture && texture->hasAlpha() && texture->coverage(uvAt(hit.triangle, hit.u, hit.v)) < .5f;
+}
+
+void RoomRenderer::Impl::intersectFilter(const RTCFilterFunctionNArguments* args) {
+  filterHits(args, [](const Query& query, const Candidate& hit) {
+    const Impl& self = *query.renderer;
+    return (query.only_solid && self.surface.materials[hit.material].opacity < kSolidOpacity) || self.isCutOut(hit);
+  });
+}
+
 void RoomRenderer::Impl::occlusionFilter(const RTCFilterFunctionNArguments* args) {
-  const Query& query = *reinterpret_cast<const Query*>(args->context);
-  const Impl& self = *query.renderer;
-  for (unsigned i = 0; i < args->N; ++i) {
-    if (args->valid[i] != -1) continue;
-    const int32_t t = self.triangle[1][RTCHitN_primID(args->hit, args->N, i)];
-    const size_t m = size_t(self.surface.material[size_t(t)]);
-    const MipTexture* texture = self.texture_of[m];
-    const float u = RTCHitN_u(args->hit, args->N, i), v = RTCHitN_v(args->hit, args->N, i);
-    const float opacity = self.surface.materials[m].opacity;
-    if (texture && texture->hasAlpha() && texture->coverage(self.uvAt(t, u, v)) < .5f) {
-      args->valid[i] = 0;
-    } else if (opacity < 1) {
-      Vector3f& passed = query.packet->passed[RTCRayN_id(args->ray, args->N, i)];
-      passed = passed.cwiseProduct(tint(self.colourAt(t, u, v, .01f), opacity));
-      args->valid[i] = 0;
-    }
-  }
+  filterHits(args, [](const Query& query, const Candidate& hit) {
+    const Impl& self = *query.renderer;
+    if (self.isCutOut(hit)) return true;
+    const float opacity = self.surface.materials[hit.material].opacity;
+    if (!(opacity < 1)) return false;
+    Vector3f& passed = query.packet->passed[hit.ray];
+    passed = passed.cwiseProduct(tint(self.colourAt(hit.triangle, hit.u, hit.v, .01f), opacity));
+    return true;
+  });
 }
 
 Vector3f RoomRenderer::Impl::colourAt(int32_t t, float u, float v, float footprint) const {
