@@ -5,7 +5,9 @@
 #include <gtest/gtest.h>
 #include <openvdb/io/File.h>
 #include <openvdb/openvdb.h>
+#include <openvdb/points/PointDataGrid.h>
 #include <openvdb/tools/Interpolation.h>
+#include <openvdb/tools/LevelSetSphere.h>
 #include <sys/resource.h>
 
 #include <algorithm>
@@ -20,6 +22,7 @@
 
 #include "tests/vdb_files.h"
 #include "vdb/grid_instances.h"
+#include "vdb/mask_vdb.h"
 
 namespace vdbc {
 namespace {
@@ -650,6 +653,105 @@ print('BOX', *lows, *highs)
   for (const char* name : {"observed", "generated", "seen_empty"})
     EXPECT_EQ(grids[name], "BOOLEAN") << name;
   EXPECT_EQ(grids["Cd"], "VECTOR_FLOAT");
+}
+
+// --- several completions, masks ------------------------------------------------------------------
+
+TEST(SceneVdb, TheSameSceneGivesTheSameBytes) {
+  const TemporaryFolder folder;
+  const SceneVoxels voxels = shellScene(turnedFrame(), 9.5);
+  writeSceneVdb(voxels, folder / "a.vdb");
+  writeSceneVdb(voxels, folder / "b.vdb");
+  EXPECT_TRUE(bytesOf(folder / "a.vdb") == bytesOf(folder / "b.vdb"));
+  SceneVoxels other = shellScene(turnedFrame(), 9.5);
+  other.density[0] *= .5f;
+  writeSceneVdb(other, folder / "b.vdb");
+  openvdb::io::File a(folder / "a.vdb"), b(folder / "b.vdb");
+  a.open(false), b.open(false);
+  EXPECT_NE(a.getUniqueTag(), b.getUniqueTag());
+  EXPECT_EQ(a.getUniqueTag().size(), 36u);
+}
+
+TEST(OccupancyVdb, IsMeanAndVarianceOfTheCompletions) {
+  const TemporaryFolder folder;
+  const VoxelFrame frame = turnedFrame();
+  const Coord always = frame.bounds.min(), once = always.offsetBy(1, 2, 3);
+  std::vector<std::vector<Coord>> completions(10, {always});
+  completions[3].push_back(once);
+  writeOccupancyVdb(frame, completions, folder / "o.vdb");
+  openvdb::io::File file(folder / "o.vdb");
+  file.open(false);
+  for (const auto& [name, expected] :
+       {std::pair<const char*, std::pair<float, float>>{"occupancy_mean", {1.f, .1f}},
+        {"occupancy_variance", {0.f, .1f * .9f}}}) {
+    const auto grid = openvdb::gridPtrCast<openvdb::FloatGrid>(file.readGrid(name));
+    EXPECT_EQ(grid->activeVoxelCount(), 2u);
+    EXPECT_EQ(grid->tree().getValue(always), expected.first);
+    EXPECT_NEAR(grid->tree().getValue(once), expected.second, 1e-7);
+    EXPECT_TRUE(grid->transform() == *fileTransform(frame));
+  }
+  EXPECT_THROW(writeOccupancyVdb(frame, {}, folder / "none.vdb"), Error);
+}
+
+/// Nodes of level 1 with a voxel centre for which `inside`(world point).
+template <typename Inside>
+std::set<Coord> nodesWhere(const VoxelFrame& frame, Inside inside) {
+  std::set<Coord> nodes;
+  for (auto v = frame.bounds.begin(); v; ++v) {
+    const Eigen::Vector3d centre((*v).x() + .5, (*v).y() + .5, (*v).z() + .5);
+    if (inside(frame.toWorld(centre))) nodes.insert(tokenCoord(*v, 1));
+  }
+  return nodes;
+}
+
+TEST(TokenMaskVdb, HoldsTheNodesThatTheMaskReachesInTheWorld) {
+  const TemporaryFolder folder;
+  VoxelFrame frame = turnedFrame();
+  frame.bounds = CoordBBox(Coord(-8), Coord(23));
+  const Eigen::Vector3d centre = frame.toWorld(Eigen::Vector3d(7, 9, 5));
+  auto nodesOf = [&](const openvdb::GridBase::Ptr& grid) {
+    openvdb::io::File(folder / "mask.vdb").write({grid});
+    const std::vector<Coord> found = activeCoords(readTokenMask(folder / "mask.vdb", frame, 1));
+    EXPECT_FALSE(found.empty());
+    return std::set<Coord>(found.begin(), found.end());
+  };
+  // A ball as a level set: its inside, to one voxel of the mask.
+  const float radius = 6 * frame.voxel_m, voxel = .02f;
+  const std::set<Coord> ball = nodesOf(openvdb::tools::createLevelSetSphere<openvdb::FloatGrid>(
+      radius, openvdb::Vec3f(float(centre.x()), float(centre.y()), float(centre.z())), voxel));
+  auto inBall = [&](double r) {
+    return nodesWhere(frame, [&, r](const Eigen::Vector3d& p) { return (p - centre).norm() < r; });
+  };
+  const std::set<Coord> least = inBall(radius - voxel), most = inBall(radius + voxel);
+  EXPECT_TRUE(std::includes(ball.begin(), ball.end(), least.begin(), least.end()));
+  EXPECT_TRUE(std::includes(most.begin(), most.end(), ball.begin(), ball.end()));
+  // A box of one tile of another grid, in its own voxels.
+  auto box = openvdb::BoolGrid::create(false);
+  box->setTransform(openvdb::math::Transform::createLinearTransform(.05));
+  const openvdb::Vec3d at = box->worldToIndex(openvdb::Vec3d(centre.x(), centre.y(), centre.z()));
+  const CoordBBox cells(Coord::round(at).offsetBy(-9, -5, -7), Coord::round(at).offsetBy(9, 5, 7));
+  box->tree().sparseFill(cells, true, true);
+  EXPECT_EQ(nodesOf(box), nodesWhere(frame, [&](const Eigen::Vector3d& p) {
+              return cells.isInside(Coord::round(box->worldToIndex(openvdb::Vec3d(p.x(), p.y(), p.z()))));
+            }));
+}
+
+TEST(TokenMaskVdb, TakesTheGridNamedMaskAndRefusesPoints) {
+  const TemporaryFolder folder;
+  VoxelFrame frame;
+  frame.bounds = CoordBBox(Coord(0), Coord(7));
+  auto other = openvdb::FloatGrid::create(), mask = openvdb::FloatGrid::create();
+  other->setTransform(fileTransform(frame)), mask->setTransform(fileTransform(frame));
+  other->setName("density"), mask->setName("mask");
+  other->tree().setValueOn(Coord(0), 1), mask->tree().setValueOn(Coord(6, 6, 6), 0);
+  openvdb::io::File(folder / "two.vdb").write({other, mask});
+  EXPECT_EQ(activeCoords(readTokenMask(folder / "two.vdb", frame, 1)), std::vector<Coord>{Coord(3)});
+  openvdb::io::File(folder / "one.vdb").write({other});
+  EXPECT_EQ(activeCoords(readTokenMask(folder / "one.vdb", frame, 1)), std::vector<Coord>{Coord(0)});
+  auto points = openvdb::points::PointDataGrid::create();
+  openvdb::io::File(folder / "points.vdb").write({points});
+  EXPECT_THROW(readTokenMask(folder / "points.vdb", frame, 1), Error);
+  EXPECT_THROW(readTokenMask(folder / "missing.vdb", frame, 1), Error);
 }
 
 }  // namespace

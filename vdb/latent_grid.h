@@ -21,4 +21,21 @@ struct LatentGrid {
   int64_t size() const { return int64_t(ijk.size()); }
 };
 
+/// The tokens whose row `keep` accepts, in their order.
+template <typename Keep>
+LatentGrid keepTokens(const LatentGrid& from, const Keep& keep) {
+  LatentGrid to;
+  to.frame = from.frame, to.level = from.level, to.dim = from.dim;
+  for (size_t i = 0; i < from.ijk.size(); ++i) {
+    if (!keep(i)) continue;
+    const auto z = from.z.begin() + std::ptrdiff_t(i * size_t(from.dim));
+    to.z.insert(to.z.end(), z, z + from.dim);
+    to.ijk.push_back(from.ijk[i]);
+    to.observed.push_back(from.observed[i]);
+    to.probability.push_back(from.probability[i]);
+    to.bfs_level.push_back(from.bfs_level[i]);
+  }
+  return to;
+}
+
 }  // namespace vdbc

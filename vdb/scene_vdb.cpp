@@ -201,6 +201,35 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
   writeVdb("writeSceneVdb", path, grids, metadata);
 }
 
+void writeOccupancyVdb(const VoxelFrame& frame, const std::vector<std::vector<Coord>>& completions,
+                       const std::string& path) {
+  require(!completions.empty(), "writeOccupancyVdb: ", path, ": expected one completion or more, found none");
+  openvdb::initialize();
+  const auto mean = FloatGrid::create(), variance = FloatGrid::create();
+  auto share = mean->getUnsafeAccessor();
+  for (const std::vector<Coord>& voxels : completions)
+    for (const Coord& ijk : voxels) share.setValueOn(ijk, share.getValue(ijk) + 1);  // counts first: exact
+  auto spread = variance->getUnsafeAccessor();
+  for (auto value = mean->beginValueOn(); value; ++value) {
+    value.setValue(*value / float(completions.size()));
+    spread.setValueOn(value.getCoord(), *value * (1 - *value));
+  }
+  mean->setName("occupancy_mean"), variance->setName("occupancy_variance");
+  openvdb::GridCPtrVec grids;
+  const auto transform = fileTransform(frame);
+  for (const auto& grid : {mean, variance}) {
+    grid->setCreator("vdb_complete");
+    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
+    grid->setTransform(transform);
+    grids.push_back(grid);
+  }
+  openvdb::MetaMap metadata;
+  metadata.insertMeta("creator", openvdb::StringMetadata("vdb_complete"));
+  metadata.insertMeta("completions", openvdb::Int32Metadata(int32_t(completions.size())));
+  insertVolume(frame, &metadata);
+  writeVdb("writeOccupancyVdb", path, grids, metadata);
+}
+
 SceneVoxels readSceneVdb(const std::string& path) {
   constexpr const char* kOperation = "readSceneVdb";
   constexpr uint64_t kMaxBytes = uint64_t(1) << 32;

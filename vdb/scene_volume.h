@@ -45,7 +45,7 @@ struct SceneVoxels {
   std::vector<Eigen::Vector3f> colour_linear;  // scene-linear Rec.709
   std::vector<float> density;                  // 0-1, opacity of the voxel
   std::vector<uint8_t> observed;               // 1: an input view saw it; 0: generated
-  std::vector<float> probability;              // occupancy probability, 1 for observed
+  std::vector<float> probability;              // its token's, which tau is compared with; 1 for observed
   std::vector<int32_t> bfs_level;              // growth level, 0 for observed
   TokenMask empty;                             // E of the input views (kept open in `surface`)
 };
@@ -59,6 +59,12 @@ struct SceneVoxels {
 /// Throws Error for voxels outside the bounds, twice the same, or with values that are not finite,
 /// and where the file cannot be written.
 void writeSceneVdb(const SceneVoxels& voxels, const std::string& path);
+
+/// Several completions of one place, each as its voxels: float grids `occupancy_mean` and
+/// `occupancy_variance` (the share of them that fill a voxel, m, and m (1 - m)), cell-centred as above.
+/// Throws Error where the file cannot be written.
+void writeOccupancyVdb(const VoxelFrame& frame, const std::vector<std::vector<Coord>>& completions,
+                       const std::string& path);
 
 /// Reads back what writeSceneVdb wrote (all but `surface`, which is derived), voxels in the order
 /// of the file's tree. Also when another program wrote the file again. Throws Error on files that

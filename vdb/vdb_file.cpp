@@ -50,6 +50,22 @@ class MemoryBuffer : public std::streambuf {
   }
 };
 
+/// OpenVDB names each file by a random UUID. Ours are named by their content: the same place gives the
+/// same bytes.
+void nameByContent(std::string* archive) {
+  constexpr size_t kUuidAt = 21, kUuidBytes = 36;  // behind magic, three versions and a flag; ASCII
+  archive->replace(kUuidAt, kUuidBytes, kUuidBytes, '0');
+  const std::string sum = checksumTrailer(archive->data(), archive->size());
+  std::string name;
+  for (size_t i = 0; name.size() < kUuidBytes; ++i) {
+    const bool dash = name.size() == 8 || name.size() == 13 || name.size() == 18 || name.size() == 23;
+    if (dash) name += '-';
+    const auto byte = uint8_t(sum[sum.size() - 1 - i / 2 % 8]);
+    name += "0123456789abcdef"[i % 2 ? byte & 15 : byte >> 4];
+  }
+  archive->replace(kUuidAt, kUuidBytes, name);
+}
+
 }  // namespace
 
 void writeVdb(const char* operation, const std::string& path, const openvdb::GridCPtrVec& grids,
@@ -57,6 +73,7 @@ void writeVdb(const char* operation, const std::string& path, const openvdb::Gri
   std::ostringstream archive;
   SeekableArchive().writeTo(archive, grids, metadata);
   std::string bytes = archive.str();
+  nameByContent(&bytes);
   bytes += checksumTrailer(bytes.data(), bytes.size());
   writeFile(operation, path, bytes.data(), bytes.size());
 }
