@@ -615,7 +615,8 @@ View readExr(const std::string& path, const std::string& name, const ReadViewsSe
 struct Source {
   std::string transforms;      // the transforms.json, or
   std::vector<fs::path> exrs;  // EXR files, sorted by name, or
-  std::string pointmaps;       // the .npz
+  std::string pointmaps;       // the .npz, or
+  std::string volume;          // the .vdb
 };
 
 Source findSource(const std::string& path) {
@@ -645,9 +646,11 @@ Source findSource(const std::string& path) {
     source.exrs.push_back(path);
   } else if (extension == ".npz") {
     source.pointmaps = path;
+  } else if (extension == ".vdb") {
+    source.volume = path;
   } else {
     throw Error(joinText(kRead, ": ", path,
-                         ": expected a folder, a transforms.json, an .exr or an .npz file"));
+                         ": expected a folder, a transforms.json, an .exr, an .npz or a .vdb file"));
   }
   return source;
 }
@@ -685,6 +688,7 @@ std::vector<View> readViews(const std::string& path, const ReadViewsSettings& se
   if (!source.pointmaps.empty()) return readPointmaps(path, settings);
   require(settings.metres_per_unit == 0, kRead, ": ", path,
           ": is in metres already (expected a scale for .npz only)");
+  if (!source.volume.empty()) return readVolumeViews(path, settings);
   if (!source.transforms.empty()) return readTransforms(source.transforms, settings);
   return readAll(selectFrames(settings, source.exrs.size(), path), [&](size_t i) {
     return readExr(source.exrs[i].string(), source.exrs[i].filename().string(), settings);
@@ -694,6 +698,7 @@ std::vector<View> readViews(const std::string& path, const ReadViewsSettings& se
 Eigen::Vector3d conventionalUp(const std::string& path) {
   const Source source = findSource(path);
   if (!source.pointmaps.empty()) return pointmapUp(path);
+  if (!source.volume.empty()) return volumeUp(path);
   if (source.transforms.empty()) return Eigen::Vector3d::UnitY();
   const Applied applied = appliedTransform(parseTransforms(source.transforms), source.transforms);
   return applied.file_from_source.linear().transpose() * Eigen::Vector3d::UnitZ();

@@ -29,17 +29,20 @@ struct ReadViewsSettings {
 };
 
 /// Reads views from: a folder with transforms.json, a transforms.json, an .exr or a folder of .exr
-/// with Z or P and worldToCamera + worldToNDC, or pointmaps (.npz, docs/formats.md). Adds no frame
+/// with Z or P and worldToCamera + worldToNDC, pointmaps (.npz, docs/formats.md), or a level set or
+/// fog volume (.vdb), of which views are made by ray casting. Adds no frame
 /// conversion beyond camera axes; a transforms.json's applied_transform and applied_scale are
 /// undone. 0 and 65535 in a 16-bit depth PNG are no measurement. Frames are read in parallel; the
 /// first bad frame's Error is thrown.
 /// Throws Error: no views, views without depth, mismatched sizes, corrupt files, frames out of range,
 /// distortion other than zero, singular or non-rigid poses, depth without one valid pixel, a
-/// pointmap of unknown scale, a scale for what is in metres already.
+/// pointmap of unknown scale, a scale for what is in metres already, a volume without surface or
+/// without free space for a camera.
 std::vector<View> readViews(const std::string& path, const ReadViewsSettings& settings = {});
 
 /// The unit vector that points up in the world of views read from `path`: +Z for transforms.json
-/// (turned back by its applied_transform), +Y for EXR, the mean of the cameras' up for .npz.
+/// (turned back by its applied_transform), +Y for EXR, the mean of the cameras' up for .npz; for
+/// .vdb the grid's own z where this program wrote it, +Y where Houdini did, else +Z.
 Eigen::Vector3d conventionalUp(const std::string& path);
 
 /// What the units of an .npz are in metres, and how that is known.
