@@ -328,6 +328,20 @@ TEST_F(Homes, FurnitureOfGroupsIsPlacedAndTheInvisibleIsNot) {
   EXPECT_TRUE(read(box("", "height='250'", false)).empty()) << "not furnished";
 }
 
+TEST_F(Homes, AllButTheFurnitureIsShell) {
+  const Room room = read(box(window(200, 90, 120, 90))).at(0);
+  ASSERT_EQ(room.pieces.size(), 2u);  // the chairs
+  const size_t chair = assets().mesh(assets().find(room.pieces[0].model))->mesh.triangles.size();
+  ASSERT_EQ(room.is_shell.size(), room.surface.mesh.triangles.size());
+  EXPECT_EQ(std::count(room.is_shell.begin(), room.is_shell.end(), 0), int64_t(2 * chair));
+  for (const Eigen::Vector3i& t : shellMesh(room).triangles)
+    for (int corner = 0; corner < 3; ++corner)  // stands in no chair
+      for (const Piece& piece : room.pieces) {
+        const Vector3f p = room.surface.mesh.vertices[size_t(t[corner])];
+        EXPECT_GT(piece.box.exteriorDistance(room.world_from_room.inverse() * p), 0);
+      }
+}
+
 TEST_F(Homes, SameHomeSameRoom) {
   const Room a = homeRoom(assets(), 5), b = homeRoom(assets(), 5);
   EXPECT_EQ(a.surface.mesh.vertices, b.surface.mesh.vertices);

@@ -101,6 +101,11 @@ bool isFree(const Room& room, const Vector3f& p_room, float margin_m) {
   });
 }
 
+bool isWithin(const Room& room, const Vector3f& p_room) {
+  const Vector2f p = p_room.head<2>();
+  return p_room.z() >= 0 && p_room.z() <= ceilingAt(room.ceilings, p) && isInside(room.floor, p);
+}
+
 std::vector<Camera> randomCameras(const Room& room, const RayTarget& solid, int count, int width,
                                   int height, std::mt19937_64& random) {
   constexpr float kMargin = .3f;  // metres from walls and furniture
@@ -165,15 +170,20 @@ std::vector<Camera> coveringCameras(const RayTarget& solid, const std::vector<Ca
   return chosen;
 }
 
-std::vector<View> roomViews(const Room& room, const RoomRenderer& renderer, int count, int width,
-                            int height, int samples, uint64_t seed) {
+std::vector<Camera> roomCameras(const Room& room, const RoomRenderer& renderer, int count, int width,
+                                int height, uint64_t seed) {
   std::mt19937_64 random(seed);
   const RayTarget& solid = renderer.rayTarget();
   std::vector<Camera> cameras = coveringCameras(
       solid, randomCameras(room, solid, 4 * count, width, height, random), count);
   for (size_t i = cameras.size(); i-- > 1;) std::swap(cameras[i], cameras[random() % (i + 1)]);
+  return cameras;
+}
+
+std::vector<View> roomViews(const Room& room, const RoomRenderer& renderer, int count, int width,
+                            int height, int samples, uint64_t seed) {
   std::vector<View> views;
-  for (const Camera& camera : cameras)
+  for (const Camera& camera : roomCameras(room, renderer, count, width, height, seed))
     views.push_back(renderer.render(camera, samples, seed + views.size()));
   return views;
 }

@@ -1111,6 +1111,7 @@ struct Plan {
 /// Surface, lights and pieces of the levels in sight of one.
 struct Built {
   SurfaceMesh surface;
+  std::vector<uint8_t> is_shell;  // as Room
   std::vector<RoomLight> lights;
   std::vector<Placed> placed;
 };
@@ -1195,6 +1196,7 @@ Built build(const AssetLibrary& assets, const Plan& plan, int level) {
         isWindow(assets.models()[opening.item->model], *assets.mesh(opening.item->model)))
       addDaylight(plan, opening, &faces, &built.lights);
   built.surface = std::move(faces.surface);
+  built.is_shell.assign(built.surface.mesh.triangles.size(), 1);
   for (const Item& item : plan.home.items) {
     if (!levels.count(item.level)) continue;
     const SurfaceMesh mesh = coloured(*assets.mesh(item.model), item);
@@ -1202,6 +1204,7 @@ Built build(const AssetLibrary& assets, const Plan& plan, int level) {
     for (const Vector3f& v : mesh.mesh.vertices) placed.box.extend(placed.world_from_model * v);
     addLamps(assets.models()[item.model], placed, &built.lights);
     built.surface.append(mesh, placed.world_from_model);
+    built.is_shell.resize(built.surface.mesh.triangles.size(), item.is_opening);
     built.placed.push_back(placed);
   }
   return built;
@@ -1306,6 +1309,7 @@ Room roomOf(const AssetLibrary& assets, const Plan& plan, const Space& space, Bu
     if (!placed.item->is_opening && plan.holds(space, *placed.item)) room.pieces.push_back(piece);
   }
   room.surface = std::move(built.surface);
+  room.is_shell = std::move(built.is_shell);
   room.lights = std::move(built.lights);
   room.lights = lightsInSight(room);
   if (std::none_of(room.lights.begin(), room.lights.end(),

@@ -760,6 +760,7 @@ Room makeRoom(const AssetLibrary& assets, uint64_t seed) {
   room.name = "rooms:" + std::to_string(seed);
   room.kind = kind.name;
   Shell shell = buildShell(assets, choosePlan(kind, dice), dice, &room);
+  room.is_shell.assign(room.surface.mesh.triangles.size(), 1);
   Furnisher furnisher(assets, dice, seed < kFirstTrainingSeed, std::move(shell), &room);
   kind.furnish(furnisher);
   if (room.kind != "bathroom") {
@@ -769,6 +770,7 @@ Room makeRoom(const AssetLibrary& assets, uint64_t seed) {
     onWalls(furnisher);
   }
   ceilingLamps(furnisher, room);
+  room.is_shell.resize(room.surface.mesh.triangles.size(), 0);
   toWorld(room, dice);
   return room;
 }

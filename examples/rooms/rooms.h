@@ -42,6 +42,9 @@ struct Room {
   std::string kind;  // bedroom, living, dining, study, kitchen, bathroom, office; of a home its own name
   Eigen::Isometry3f world_from_room = Eigen::Isometry3f::Identity();  // yaw about +Z and place
   SurfaceMesh surface;
+  /// [T] 1: of the shell (floors, ceilings, walls, skirting, doors, windows and their curtains); 0: of what stands,
+  /// lies or hangs in it. Empty where that is not known.
+  std::vector<uint8_t> is_shell;
   std::vector<RoomLight> lights;
   Sun sun;
   std::vector<Eigen::Vector2f> floor;        // outline, counter-clockwise from above
@@ -71,6 +74,12 @@ std::vector<Room> readHome(const AssetLibrary& assets, const std::string& sh3d_p
 /// Whether a point of the room frame is in the room's air, at least margin_m from its walls, floor,
 /// ceilings and solids.
 bool isFree(const Room& room, const Eigen::Vector3f& p_room, float margin_m);
+
+/// Whether a point of the room frame is over the room's floor and below its ceilings, in furniture or not.
+bool isWithin(const Room& room, const Eigen::Vector3f& p_room);
+
+/// The solid triangles (solidMesh) of the shell, world frame. Throws Error where is_shell is empty.
+TriangleMesh shellMesh(const Room& room);
 
 /// Random cameras in free space at human heights (1.1-1.9 m), looking roughly level, vertical field
 /// of view 70 degrees, whose view is not blocked by something near. `solid` is the room's solidMesh.
@@ -120,8 +129,11 @@ class RoomRenderer {
 /// Samples a pixel: 30 dB or more against 4,096 in most rooms at 224 x 224 (docs/rooms.md).
 constexpr int kRoomSamples = 8;
 
-/// `count` pictures of a room from the covering ones of four times as many random cameras, in random
-/// order: any first n of them are a random choice. The same for the same seed.
+/// `count` cameras in a room, the covering ones of four times as many random ones, in random order: any
+/// first n of them are a random choice. The same for the same seed.
+std::vector<Camera> roomCameras(const Room& room, const RoomRenderer& renderer, int count, int width,
+                                int height, uint64_t seed);
+/// Their pictures; the i-th is rendered with seed + i.
 std::vector<View> roomViews(const Room& room, const RoomRenderer& renderer, int count, int width,
                             int height, int samples, uint64_t seed);
 

@@ -196,6 +196,17 @@ FloatGrid::Ptr distanceGrid(const TriangleMesh& mesh, const VoxelFrame& frame) {
 
 }  // namespace
 
+TriangleMesh shellMesh(const Room& room) {
+  require(room.is_shell.size() == room.surface.mesh.triangles.size(), room.name, ": expected to know which of ",
+          room.surface.mesh.triangles.size(), " triangles are of the shell, found ", room.is_shell.size());
+  TriangleMesh shell;
+  shell.vertices = room.surface.mesh.vertices;
+  for (size_t i = 0; i < room.is_shell.size(); ++i)
+    if (room.is_shell[i] && room.surface.materials[size_t(room.surface.material[i])].opacity >= kSolidOpacity)
+      shell.triangles.push_back(room.surface.mesh.triangles[i]);
+  return shell;
+}
+
 RoomTruth roomTruth(const Room& room, float voxel_m) {
   constexpr int kSeeds = 256;
   RoomTruth truth;
