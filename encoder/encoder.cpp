@@ -15,6 +15,7 @@ EncoderConfig EncoderConfig::paper() {
   c.preset = "paper";
   c.voxel_width = 256, c.width = 512, c.heads = 16;
   c.blocks = 6, c.decoder_blocks = 6, c.window = 1024;
+  c.latent_dim = 32, c.latent_groups = 8;
   c.kl_weight = .1f;
   c.gaussians_per_voxel = 216;
   return c;
@@ -101,7 +102,9 @@ LatentGrid Encoder::encode(const std::vector<View>& views, const Observation& o,
   torch::NoGradGuard no_grad;
   report(progress, -1);
   const EncoderConfig& c = config();
-  const Tensor z = impl_->net->normalise(impl_->net->encode(encoderInput(views, o, c)).mean).contiguous();
+  // Rounded as files hold them: what is decoded or completed now is what a file would give.
+  const Tensor z = impl_->net->normalise(impl_->net->encode(encoderInput(views, o, c)).mean)
+                       .to(torch::kHalf).to(torch::kFloat32).contiguous();
   LatentGrid grid;
   grid.frame = o.frame, grid.level = c.levels, grid.dim = c.latent_dim;
   grid.ijk = o.tokens.coords(c.levels);

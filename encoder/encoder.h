@@ -23,8 +23,8 @@ struct EncoderConfig {
   int blocks = 2;              // bidirectional blocks, L
   int decoder_blocks = 2;
   int window = 256;            // tokens per self-attention window
-  int latent_dim = 32;
-  int latent_groups = 8;       // of the GroupNorm after sampling, per token; 0: none
+  int latent_dim = 64;
+  int latent_groups = 1;       // of the GroupNorm after sampling, per token; 0: none
   float kl_weight = 1e-4f;     // beta; image error and KL are both means (spec E12)
   float occupancy_weight = 0.02f;  // of BCE-up
   int gaussians_per_voxel = 8;  // M
@@ -63,8 +63,8 @@ class Encoder {
   std::string trainedOn() const;
   ObservationSettings observationSettings() const;
 
-  /// Latents (posterior means, normalised) of the observed tokens. Spec E14: the same for condition
-  /// and target views.
+  /// Latents (posterior means, normalised, rounded to half precision) of the observed tokens. Spec E14:
+  /// the same for condition and target views.
   LatentGrid encode(const std::vector<View>& views, const Observation& observation,
                     Progress& progress) const;
 

@@ -13,7 +13,7 @@ int main(int argc, char** argv) try {
   settings.volume.up = conventionalUp(argv[1]);
   Progress silent;
   const Completion place = completeScene(views, encoder, completer, settings, silent);
-  writeCompletion(views, place, argv[3], settings.volume.up, silent);
+  writeCompletion(views, place, encoder.hash(), argv[3], settings.volume.up, silent);
 } catch (const std::exception& e) {
   std::fprintf(stderr, "%s\n", e.what());
   return 1;

@@ -7,6 +7,7 @@
 #include <functional>
 
 #include "splat/rasterize.h"
+#include "vdb/latent_vdb.h"
 
 namespace vdbc {
 
@@ -34,17 +35,23 @@ Encoding encodeScene(const std::vector<View>& views, const Encoder& encoder,
   return e;
 }
 
+Completion completeLatents(const LatentGrid& start, const ObservedSpace& space, const Encoder& encoder,
+                           const Completer& completer, const SceneSettings& settings, Progress& progress,
+                           const LevelListener& listener) {
+  Completion c{space, keepTokens(start, [&](size_t i) { return start.observed[i] != 0; }), {}, {}, {}};
+  c.whole = completer.complete(start, space, settings.completion, progress, listener);
+  progress.start("decode");
+  c.seen_decoded = encoder.decode(c.seen, space, settings.child_threshold, progress);
+  c.whole_decoded = encoder.decode(c.whole, space, settings.child_threshold, progress);
+  progress.end();
+  return c;
+}
+
 Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
                          const Completer& completer, const SceneSettings& settings,
                          Progress& progress) {
-  Encoding e = encodeScene(views, encoder, settings, progress);
-  Completion c{std::move(e.observation), std::move(e.latents), {}, {}, {}};
-  c.whole = completer.complete(c.seen, c.observation.space, settings.completion, progress);
-  progress.start("decode");
-  c.seen_decoded = encoder.decode(c.seen, c.observation.space, settings.child_threshold, progress);
-  c.whole_decoded = encoder.decode(c.whole, c.observation.space, settings.child_threshold, progress);
-  progress.end();
-  return c;
+  const Encoding e = encodeScene(views, encoder, settings, progress);
+  return completeLatents(e.latents, e.observation.space, encoder, completer, settings, progress);
 }
 
 SceneVoxels sceneVoxels(const DecodedGrid& d, const LatentGrid& latents, const ObservedSpace& space) {
@@ -71,7 +78,7 @@ SceneVoxels sceneVoxels(const DecodedGrid& d, const LatentGrid& latents, const O
     // A voxel was observed if a pixel's point lies in it; an observed token may gain unseen voxels.
     const bool observed = filled.isValueOn(d.voxels[i]);
     v.observed.push_back(observed);
-    v.probability.push_back(observed ? 1.f : latents.probability[node] * d.child_probability[i]);
+    v.probability.push_back(latents.probability[node]);
     v.bfs_level.push_back(observed ? 0 : std::max(1, latents.bfs_level[node]));
   }
   return v;
@@ -137,8 +144,6 @@ Image contactSheet(const std::vector<View>& views, const Completion& completion,
 }
 
 namespace {
-constexpr const char* kPicture = ".png";
-constexpr const char* kEndings[] = {".points.vdb", ".ply", kPicture, ".vdb"};
 
 // What writes one of a scene's files, by its ending.
 using Writers = std::vector<std::pair<const char*, std::function<void(const std::string&)>>>;
@@ -164,21 +169,27 @@ void writeTogether(const Writers& writers, const std::string& stem, Progress& pr
   progress.end();
 }
 
-// `picture` may be empty: no contact sheet.
+// The grids and Gaussians of a scene.
+Writers sceneWriters(const SceneVoxels& voxels, const Gaussians& gaussians, const Provenance& provenance,
+                     const Eigen::Vector3d& up) {
+  return {{".points.vdb", [&](const std::string& path) { writePointsVdb(gaussians, provenance, path); }},
+          {".ply", [&gaussians, up](const std::string& path) { writePly(gaussians, path, up.cast<float>()); }},
+          {".vdb", [&](const std::string& path) { writeSceneVdb(voxels, path); }}};
+}
+
+// A scene's files and `more`.
 void writeScene(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
-                const std::string& stem, const Eigen::Vector3d& up,
-                const std::function<Image()>& picture, Progress& progress) {
+                const std::string& stem, const Eigen::Vector3d& up, const Writers& more, Progress& progress) {
   const SceneVoxels voxels = sceneVoxels(decoded, latents, space);
-  const Gaussians& g = decoded.gaussians;
-  const int64_t per_voxel = voxels.ijk.empty() ? 0 : g.size() / int64_t(voxels.ijk.size());
-  Writers writers = {
-      {".points.vdb",
-       [&](const std::string& path) { writePointsVdb(g, gaussianProvenance(voxels, per_voxel), path); }},
-      {".ply", [&](const std::string& path) { writePly(g, path, up.cast<float>()); }},
-      {".vdb", [&](const std::string& path) { writeSceneVdb(voxels, path); }}};
-  if (picture) writers.push_back({kPicture, [&](const std::string& path) { writePng(picture(), path); }});
+  const int64_t per_voxel = voxels.ijk.empty() ? 0 : decoded.gaussians.size() / int64_t(voxels.ijk.size());
+  const Provenance provenance = gaussianProvenance(voxels, per_voxel);
+  Writers writers = sceneWriters(voxels, decoded.gaussians, provenance, up);
+  writers.insert(writers.end(), more.begin(), more.end());
   writeTogether(writers, stem, progress);
 }
+
+Eigen::Vector3d upOf(const VoxelFrame& frame) { return frame.world_from_grid.linear().col(2); }
+
 }  // namespace
 
 void requireCreatable(const std::string& path) {
@@ -198,26 +209,58 @@ void requireCreatable(const std::string& path) {
   std::remove(probe.c_str());
 }
 
-std::string outputStem(const std::string& path, bool with_picture) {
+std::string outputStem(const std::string& path, const std::vector<std::string>& more) {
   const fs::path p(path);
-  if (p.extension() != ".vdb" || p.stem().empty())
+  if (p.extension() != ".vdb" || p.stem().empty() || p.stem().extension() == ".latent")
     throw UsageError(joinText("--output: ", path, ": expected a name that ends in .vdb"));
   const std::string stem = (p.has_parent_path() ? p.parent_path() / p.stem() : p.stem()).string();
-  for (const char* ending : kEndings)
-    if (with_picture || ending != kPicture) requireCreatable(stem + ending);
+  for (const char* ending : kSceneEndings) requireCreatable(stem + ending);
+  for (const std::string& ending : more) requireCreatable(stem + ending);
   return stem;
 }
 
-void writeCompletion(const std::vector<View>& views, const Completion& c, const std::string& stem,
-                     const Eigen::Vector3d& up, Progress& progress) {
-  writeScene(c.whole_decoded, c.whole, c.observation.space, stem, up,
-             [&] { return contactSheet(views, c, up); }, progress);
+void writeCompletion(const std::vector<View>& views, const Completion& c, const std::string& encoder_hash,
+                     const std::string& stem, const Eigen::Vector3d& up, Progress& progress) {
+  Writers more = {{kLatentEnding, [&](const std::string& path) { writeLatentVdb({c.whole, c.space, encoder_hash, ""}, path); }}};
+  if (!views.empty())
+    more.push_back({kPictureEnding, [&](const std::string& path) { writePng(contactSheet(views, c, up), path); }});
+  writeScene(c.whole_decoded, c.whole, c.space, stem, up, more, progress);
 }
 
 void writeDecoded(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
                   const std::string& stem, Progress& progress) {
-  const Eigen::Vector3d up = latents.frame.world_from_grid.linear().col(2);
-  writeScene(decoded, latents, space, stem, up, nullptr, progress);
+  writeScene(decoded, latents, space, stem, upOf(latents.frame), {}, progress);
+}
+
+Rethresholded rethreshold(const std::string& from, float tau, const std::string& to, Progress& progress) {
+  progress.start("read");
+  const std::string grids = from + ".vdb", points = from + ".points.vdb";
+  const SceneVoxels all = readSceneVdb(grids);
+  Provenance origin;
+  Gaussians gaussians = readPointsVdb(points, &origin);
+  require(origin.recorded, "rethreshold: ", points, ": expected Gaussians with `probability` and `completed`, found neither");
+  progress.end();
+  SceneVoxels kept;
+  kept.frame = all.frame;
+  kept.empty.root() = all.empty.root();
+  for (size_t i = 0; i < all.ijk.size(); ++i) {
+    if (!all.observed[i] && !(all.probability[i] > tau)) continue;
+    kept.ijk.push_back(all.ijk[i]), kept.colour_linear.push_back(all.colour_linear[i]);
+    kept.density.push_back(all.density[i]), kept.observed.push_back(all.observed[i]);
+    kept.probability.push_back(all.probability[i]), kept.bfs_level.push_back(all.bfs_level[i]);
+  }
+  require(kept.ijk.size() < all.ijk.size(), "rethreshold: ", grids, ": every generated voxel exceeds ", tau,
+          " already (expected a tau that is larger)");
+  std::vector<int64_t> rows;
+  Provenance provenance;
+  for (size_t i = 0; i < origin.generated.size(); ++i) {
+    if (origin.generated[i] && !(origin.probability[i] > tau)) continue;
+    rows.push_back(int64_t(i));
+    provenance.generated.push_back(origin.generated[i]), provenance.probability.push_back(origin.probability[i]);
+  }
+  gaussians = selectGaussians(gaussians, rows);
+  writeTogether(sceneWriters(kept, gaussians, provenance, upOf(kept.frame)), to, progress);
+  return {int64_t(kept.ijk.size()), gaussians.size(), int64_t(all.ijk.size() - kept.ijk.size())};
 }
 
 }  // namespace vdbc

@@ -17,17 +17,17 @@ struct SceneSettings {
   float child_threshold = .05f;   // of BCE-up, for voxels that were not observed
 };
 
-/// A completed place, before it is written.
-struct Completion {
-  Observation observation;
-  LatentGrid seen, whole;         // latents of the observed tokens; the same and generated ones
-  DecodedGrid seen_decoded, whole_decoded;
-};
-
 /// What was observed, encoded.
 struct Encoding {
   Observation observation;
   LatentGrid latents;
+};
+
+/// A completed place, before it is written.
+struct Completion {
+  ObservedSpace space;            // what the views saw filled and empty
+  LatentGrid seen, whole;         // latents of the observed tokens; the same and generated ones
+  DecodedGrid seen_decoded, whole_decoded;
 };
 
 /// Fits the volume (voxels as the encoder's weights want them), carves, pools pixels into voxels.
@@ -43,7 +43,13 @@ Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
                          const Completer& completer, const SceneSettings& settings,
                          Progress& progress);
 
-/// Voxels with colour, density and provenance, from decoded content.
+/// Completes and decodes what is encoded already: observed tokens, after them generated ones that stay
+/// (Completer::complete).
+Completion completeLatents(const LatentGrid& start, const ObservedSpace& space, const Encoder& encoder,
+                           const Completer& completer, const SceneSettings& settings, Progress& progress,
+                           const LevelListener& listener = nullptr);
+
+/// Voxels with colour, density and provenance, from decoded content. A voxel's probability is its token's.
 SceneVoxels sceneVoxels(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space);
 /// Provenance of each Gaussian.
 Provenance gaussianProvenance(const SceneVoxels& voxels, int64_t gaussians_per_voxel);
@@ -56,17 +62,31 @@ Image contactSheet(const std::vector<View>& views, const Completion& completion,
 /// Throws Error unless a file can be created at `path`; makes its folder. For before any long work.
 void requireCreatable(const std::string& path);
 
-/// Throws Error unless X.vdb can be created beside its siblings (X.png only `with_picture`); called
-/// before any long work. Returns X of an output path X.vdb.
-std::string outputStem(const std::string& vdb_path, bool with_picture = true);
+/// Endings of the files that a completion writes beside X.vdb; X.png only from views.
+constexpr const char* kSceneEndings[] = {".points.vdb", ".ply", ".vdb"};
+constexpr const char* kLatentEnding = ".latent.vdb";
+constexpr const char* kPictureEnding = ".png";
 
-/// X.vdb, X.points.vdb, X.ply and X.png. All are written to temporary names; a failure leaves none of
-/// this run's files behind.
-void writeCompletion(const std::vector<View>& views, const Completion& completion, const std::string& stem,
-                     const Eigen::Vector3d& up, Progress& progress);
+/// X of an output path X.vdb. Throws Error unless X.vdb can be created beside its siblings, those of
+/// kSceneEndings and `more`; called before any long work.
+std::string outputStem(const std::string& vdb_path, const std::vector<std::string>& more);
 
-/// The same without X.png, from decoded latents alone; up is the grid's z.
+/// X.vdb, X.points.vdb, X.ply, X.latent.vdb (by the encoder of that hash) and X.png, which needs views.
+/// All are written to temporary names; a failure leaves none of this run's files behind.
+void writeCompletion(const std::vector<View>& views, const Completion& completion, const std::string& encoder_hash,
+                     const std::string& stem, const Eigen::Vector3d& up, Progress& progress);
+
+/// X.vdb, X.points.vdb and X.ply from decoded latents alone; up is the grid's z.
 void writeDecoded(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
                   const std::string& stem, Progress& progress);
+
+struct Rethresholded {
+  int64_t voxels = 0, gaussians = 0, dropped_voxels = 0;
+};
+/// Raises tau of a finished place without any network: `from`.vdb and `from`.points.vdb less the generated
+/// voxels and Gaussians whose probability does not exceed tau, also those that close holes, as `to`.vdb,
+/// `to`.points.vdb, `to`.ply.
+/// Throws Error where a file is missing or unreadable, and if every generated voxel exceeds tau.
+Rethresholded rethreshold(const std::string& from, float tau, const std::string& to, Progress& progress);
 
 }  // namespace vdbc

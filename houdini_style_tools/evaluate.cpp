@@ -17,6 +17,7 @@ namespace vdbc {
 namespace {
 
 constexpr int kLeakRays = 8192;
+constexpr size_t kShownViews = 4;  // rows of a picture
 
 // What a method made: Gaussians to look at, voxels to trace and to count.
 struct MethodOutput {
@@ -24,15 +25,21 @@ struct MethodOutput {
   std::vector<Coord> voxels;
 };
 
-EvaluationScene roomScene(const Room& room, uint64_t seed, int views) {
+EvaluationScene roomScene(Room room, uint64_t seed, int views) {
   EvaluationScene s;
   s.name = room.name;
   const RoomRenderer renderer(room);
-  s.input = roomViews(room, renderer, views + kTargetViews, kRoomSide, kRoomSide, kRoomSamples, seed);
-  s.targets.assign(s.input.begin() + views, s.input.end());
-  s.input.resize(size_t(views));
-  s.truth = solidMesh(room.surface);
+  // The same targets for any number of input views up to that of training.
+  const int inputs = std::max(views, kRoomViews);
+  const std::vector<Camera> cameras = roomCameras(room, renderer, inputs + kTargetViews, kRoomSide, kRoomSide, seed);
+  for (int i = 0; i < int(cameras.size()); ++i)
+    if (i < views || i >= inputs)
+      (i < views ? s.input : s.targets).push_back(renderer.render(cameras[size_t(i)], kRoomSamples, seed + uint64_t(i)));
+  s.truth = solidMesh(room.surface), s.shell = shellMesh(room);
   s.free_points = freePoints(room, 64, seed);
+  s.is_within = [kept = std::make_shared<const Room>(std::move(room))](const Eigen::Vector3f& p_world) {
+    return isWithin(*kept, kept->world_from_room.inverse() * p_world);
+  };
   return s;
 }
 
@@ -59,14 +66,11 @@ EvaluationScene folderScene(const std::string& folder, int views, std::vector<in
   return s;
 }
 
-// An opaque-looking Gaussian for a cube of the grid.
-void addCube(const VoxelFrame& frame, const Eigen::Vector3d& centre_index, float edge_m,
-             const Eigen::Vector3f& srgb, Gaussians* g) {
-  g->mean.push_back(frame.toWorld(centre_index).cast<float>());
-  g->log_scale.push_back(Eigen::Vector3f::Constant(std::log(.5f * edge_m)));
-  g->rotation.emplace_back(1, 0, 0, 0);
-  g->opacity_logit.push_back(5);
-  for (int c = 0; c < 3; ++c) g->sh.push_back((srgb[c] - .5f) / kSh0);
+Eigen::Vector3d centreOf(const Coord& node) { return {2. * node.x() + 1, 2. * node.y() + 1, 2. * node.z() + 1}; }
+
+// An opaque-looking Gaussian for a node of level 1.
+void addNode(const VoxelFrame& frame, const Coord& node, const Eigen::Vector3f& srgb, Gaussians* g) {
+  addIsotropic(frame.toWorld(centreOf(node)), frame.voxel_m, srgb, g);
 }
 
 Eigen::Vector3f meanColour(const SceneVoxels& voxels) {
@@ -109,8 +113,7 @@ MethodOutput nearestFill(const MethodOutput& observed, const SceneVoxels& seen, 
   }
   for (auto node = states.box.begin(); node; ++node) {
     if (states.at(*node) != NodeState::kUnobserved) continue;
-    const Eigen::Vector3d centre(2. * (*node).x() + 1, 2. * (*node).y() + 1, 2. * (*node).z() + 1);
-    addCube(seen.frame, centre, 2 * seen.frame.voxel_m, colour.at(*node), &out.gaussians);
+    addNode(seen.frame, *node, colour.at(*node), &out.gaussians);
     addVoxelsOfNode(*node, &out.voxels);
   }
   return out;
@@ -135,16 +138,15 @@ MethodOutput manhattanBox(const MethodOutput& observed, const SceneVoxels& seen,
     const bool face = node.x() == lo.x() || node.x() == hi.x() || node.y() == lo.y() || node.y() == hi.y() ||
                       node.z() == lo.z() || node.z() == hi.z();
     if (!face || states.at(node) != NodeState::kUnobserved) continue;
-    addCube(seen.frame, Eigen::Vector3d(2. * node.x() + 1, 2. * node.y() + 1, 2. * node.z() + 1),
-            2 * seen.frame.voxel_m, colour, &out.gaussians);
+    addNode(seen.frame, node, colour, &out.gaussians);
     addVoxelsOfNode(node, &out.voxels);
   }
   return out;
 }
 
-// What the target views' cameras see of the Gaussians, against what is there.
+// What the target views' cameras see of the Gaussians, against what is there; keeps the first pictures in `shown`.
 void measurePictures(const EvaluationScene& scene, const Gaussians& gaussians, const UserNets& nets,
-                     MethodResult* r) {
+                     MethodResult* r, std::vector<Image>* shown) {
   const double share = 1 / double(scene.targets.size());
   RasterSettings settings;
   settings.antialias = gaussians.antialias, settings.median_depth = true;
@@ -161,35 +163,48 @@ void measurePictures(const EvaluationScene& scene, const Gaussians& gaussians, c
       r->features.push_back(nets.features->features(out.colour));
       r->true_features.push_back(nets.features->features(target.colour));
     }
+    if (shown->size() < kShownViews) shown->push_back(std::move(out.colour));
     const DepthError depth = depthError(out.median_depth.data, target.depth);
     if (std::isnan(depth.rmse_m)) continue;
     r->depth_share += share * depth.share;
     medians.push_back(depth.median_abs_m), rmses.push_back(depth.rmse_m);
   }
-  const auto mean = [](const std::vector<double>& values) {
-    return values.empty() ? kNan : std::accumulate(values.begin(), values.end(), 0.) / double(values.size());
-  };
-  r->depth_median_m = mean(medians), r->depth_rmse_m = mean(rmses);
+  r->depth_median_m = meanOf(medians), r->depth_rmse_m = meanOf(rmses);
 }
 
-MethodResult measure(const std::string& method, const EvaluationScene& scene, const MethodOutput& output,
-                     const VoxelFrame& frame, const NodeStates& states, const UserNets& nets) {
-  MethodResult r;
-  r.scene = scene.name, r.method = method, r.views = int(scene.input.size());
-  r.gaussians = output.gaussians.size();
-  measurePictures(scene, output.gaussians, nets, &r);
-  r.precision = r.recall = r.f1 = r.leak = kNan;
-  if (!scene.truth) return r;
-  auto unobserved = [&](const Coord& node) { return states.at(node) == NodeState::kUnobserved; };
-  std::set<Coord> truth, filled;
-  for (const Coord& node : surfaceNodes(*scene.truth, frame, 1))
-    if (unobserved(node)) truth.insert(node);
-  for (const Coord& voxel : output.voxels)
-    if (unobserved(tokenCoord(voxel, 1))) filled.insert(tokenCoord(voxel, 1));
-  const SetScores nodes = setScores(filled, truth);
-  r.precision = nodes.precision, r.recall = nodes.recall, r.f1 = nodes.f1;
-  r.leak = sceneLeak(scene, frame, output.voxels);
-  return r;
+// The nodes of level 1 that count: of a scene with truth, those that were unobserved.
+struct UnseenNodes {
+  const NodeStates& states;
+  std::set<Coord> truth, shell, furniture;  // what surfaces pass: shell, and the rest
+
+  UnseenNodes(const EvaluationScene& scene, const VoxelFrame& frame, const NodeStates& node_states)
+      : states(node_states) {
+    if (!scene.truth) return;
+    shell = of(surfaceNodes(*scene.shell, frame, 1));
+    truth = furniture = of(surfaceNodes(*scene.truth, frame, 1));
+    for (const Coord& node : shell) furniture.erase(node);
+  }
+  std::set<Coord> of(const std::vector<Coord>& nodes) const {
+    std::set<Coord> unseen;
+    for (const Coord& node : nodes)
+      if (states.at(node) == NodeState::kUnobserved) unseen.insert(node);
+    return unseen;
+  }
+};
+
+void measureNodes(const EvaluationScene& scene, const VoxelFrame& frame, const UnseenNodes& unseen,
+                  const std::vector<Coord>& voxels, MethodResult* r) {
+  r->precision = r->recall = r->f1 = r->iou = r->shell_recall = r->furniture_recall = r->outside = r->leak = kNan;
+  if (!scene.truth) return;
+  std::vector<Coord> nodes;
+  for (const Coord& voxel : voxels) nodes.push_back(tokenCoord(voxel, 1));
+  const std::set<Coord> filled = unseen.of(nodes);
+  const SetScores all = setScores(filled, unseen.truth);
+  r->precision = all.precision, r->recall = all.recall, r->f1 = all.f1, r->iou = all.iou;
+  r->shell_recall = setScores(filled, unseen.shell).recall;
+  r->furniture_recall = setScores(filled, unseen.furniture).recall;
+  r->outside = double(outsideCount(scene, frame, filled, unseen.truth));
+  r->leak = sceneLeak(scene, frame, voxels);
 }
 
 Eigen::MatrixXd rowsOf(const std::vector<std::vector<float>>& rows) {
@@ -237,12 +252,75 @@ SetScores setScores(const std::set<Coord>& filled, const std::set<Coord>& truth)
   double hit = 0;
   for (const Coord& node : filled) hit += double(truth.count(node));
   return {filled.empty() ? kNan : hit / double(filled.size()), truth.empty() ? kNan : hit / double(truth.size()),
-          filled.empty() && truth.empty() ? kNan : 2 * hit / double(truth.size() + filled.size())};
+          filled.empty() && truth.empty() ? kNan : 2 * hit / double(truth.size() + filled.size()),
+          filled.empty() && truth.empty() ? kNan : hit / (double(truth.size() + filled.size()) - hit)};
+}
+
+int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame, const std::set<Coord>& filled,
+                     const std::set<Coord>& truth) {
+  return std::count_if(filled.begin(), filled.end(), [&](const Coord& node) {
+    return !truth.count(node) && !scene.is_within(frame.toWorld(centreOf(node)).cast<float>());
+  });
+}
+
+Reliability reliabilityOf(const LatentGrid& latents, const std::set<Coord>& truth) {
+  Reliability bins;
+  for (size_t i = 0; i < latents.ijk.size(); ++i) {
+    if (latents.observed[i]) continue;
+    const double p = latents.probability[i];
+    ReliabilityBin& bin = bins[std::min(bins.size() - 1, size_t(p * double(bins.size())))];
+    ++bin.count, bin.sum_probability += p, bin.hits += int64_t(truth.count(latents.ijk[i]));
+  }
+  return bins;
+}
+
+double calibrationError(const Reliability& reliability) {
+  double error = 0, count = 0;
+  for (const ReliabilityBin& bin : reliability)
+    error += std::abs(double(bin.hits) - bin.sum_probability), count += double(bin.count);
+  return count > 0 ? error / count : kNan;
 }
 
 double sceneLeak(const EvaluationScene& scene, const VoxelFrame& frame, const std::vector<Coord>& voxels) {
   return leakRate(RayTarget::fromMesh(*scene.truth), RayTarget::fromVoxels(frame, voxels), scene.free_points,
                   kLeakRays, 2 * frame.voxel_m, 1);
+}
+
+void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vector3f& srgb, Gaussians* g) {
+  g->mean.push_back(mean.cast<float>());
+  g->log_scale.push_back(Eigen::Vector3f::Constant(float(std::log(sigma_m))));
+  g->rotation.emplace_back(1, 0, 0, 0);
+  g->opacity_logit.push_back(5);  // .993; the rasteriser stops at .99
+  for (int c = 0; c < 3; ++c) g->sh.push_back((srgb[c] - .5f) / kSh0);
+}
+
+Gaussians pixelAligned(const std::vector<View>& views, const std::vector<std::vector<uint8_t>>& observed) {
+  // Of .3, .4, .5, .7, 1, 1.4 and 2 best on views that are not among the input of validation rooms 900000-900003,
+  // 12 views in (21.5 dB; .4: 21.4, .7: 21.3, 1: 20.8): wider blurs, narrower leaves gaps where surfaces slope.
+  constexpr double kSigmaPixels = .5;
+  Gaussians g;
+  for (size_t i = 0; i < views.size(); ++i) {
+    const View& v = views[i];
+    for (int y = 0; y < v.camera.height; ++y)
+      for (int x = 0; x < v.camera.width; ++x) {
+        const size_t p = size_t(y) * size_t(v.camera.width) + size_t(x);
+        if (!observed[i][p]) continue;
+        const double z = v.depth[p];
+        addIsotropic(v.camera.unproject(x + .5, y + .5, z),
+                     kSigmaPixels * z / std::sqrt(v.camera.fx * v.camera.fy),
+                     {v.colour.at(x, y, 0), v.colour.at(x, y, 1), v.colour.at(x, y, 2)}, &g);
+      }
+  }
+  return g;
+}
+
+void writeColumns(const std::vector<std::vector<Image>>& columns, const std::string& path) {
+  const int width = columns[0][0].width, height = columns[0][0].height;
+  Image sheet(width * int(columns.size()), height * int(columns[0].size()), 3);
+  for (size_t c = 0; c < columns.size(); ++c)
+    for (size_t r = 0; r < columns[c].size(); ++r)
+      pasteImage(resizeImage(columns[c][r], width, height), int(c) * width, int(r) * height, &sheet);
+  writePng(sheet, path);
 }
 
 namespace {
@@ -252,72 +330,107 @@ const std::vector<Score<MethodResult>> kScores = {
     {"depth_median_m", &MethodResult::depth_median_m}, {"depth_rmse_m", &MethodResult::depth_rmse_m},
     {"depth_share", &MethodResult::depth_share},
     {"precision", &MethodResult::precision}, {"recall", &MethodResult::recall}, {"f1", &MethodResult::f1},
+    {"iou", &MethodResult::iou}, {"shell_recall", &MethodResult::shell_recall},
+    {"furniture_recall", &MethodResult::furniture_recall}, {"outside", &MethodResult::outside},
+    {"ece", &MethodResult::ece},
     {"leak", &MethodResult::leak}, {"seconds", &MethodResult::seconds},
     {"peak_rss_mb", &MethodResult::peak_rss_mb}};
 }  // namespace
 
 std::string resultJson(const MethodResult& r) { return scoresJson(r, kScores); }
 
+std::string reliabilityJson(const MethodResult& r) {
+  nlohmann::ordered_json bins = nlohmann::ordered_json::array();
+  for (const ReliabilityBin& bin : *r.reliability) bins.push_back({bin.count, bin.sum_probability, bin.hits});
+  return nlohmann::ordered_json{{"scene", r.scene}, {"views", r.views}, {"method", r.method}, {"reliability", bins}}
+      .dump();
+}
+
 std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Encoder& encoder,
                                         const Completer& completer, const SceneSettings& settings,
-                                        Progress& progress, const UserNets& nets) {
+                                        const std::string& picture, Progress& progress, const UserNets& nets) {
   SceneSettings s = settings;
   s.volume.up = scene.up;
-  std::vector<MethodResult> results;
-  auto add = [&](const char* method, const MethodOutput& output, double seconds, const VoxelFrame& frame,
-                 const NodeStates& states) {
-    results.push_back(measure(method, scene, output, frame, states, nets));
-    results.back().seconds = seconds, results.back().peak_rss_mb = peakMemoryMb();
-  };
 
   resetPeakMemory();
   auto start = std::chrono::steady_clock::now();
   const Completion c = completeScene(scene.input, encoder, completer, s, progress);
   const double completed_seconds = secondsSince(start);
   const double completed_rss = peakMemoryMb();
-  const VoxelFrame& frame = c.observation.frame;
-  const NodeStates states = poolStates(frame, c.observation.space, 1);
+  const VoxelFrame& frame = c.seen.frame;
+  const NodeStates states = poolStates(frame, c.space, 1);
+  const UnseenNodes unseen(scene, frame, states);
+
+  std::vector<MethodResult> results;
+  std::vector<std::vector<Image>> columns(1);
+  for (size_t i = 0; i < std::min(kShownViews, scene.targets.size()); ++i) columns[0].push_back(scene.targets[i].colour);
+  auto add = [&](const char* method, const MethodOutput& output, double seconds) {
+    MethodResult r;
+    r.scene = scene.name, r.method = method, r.views = int(scene.input.size());
+    r.gaussians = output.gaussians.size();
+    columns.emplace_back();
+    measurePictures(scene, output.gaussians, nets, &r, &columns.back());
+    measureNodes(scene, frame, unseen, output.voxels, &r);
+    r.seconds = seconds, r.peak_rss_mb = peakMemoryMb();
+    results.push_back(r);
+    resetPeakMemory();
+  };
 
   const MethodOutput observed{c.seen_decoded.gaussians, c.seen_decoded.voxels};
-  const SceneVoxels seen = sceneVoxels(c.seen_decoded, c.seen, c.observation.space);
+  const SceneVoxels seen = sceneVoxels(c.seen_decoded, c.seen, c.space);
 
   // Observed-only without the completion, on its own clock.
   resetPeakMemory();
   start = std::chrono::steady_clock::now();
-  {
-    const Observation o = observeScene(scene.input, encoder, s, progress);
-    encoder.decode(encoder.encode(scene.input, o, progress), o.space, s.child_threshold, progress);
-  }
+  const Observation o = observeScene(scene.input, encoder, s, progress);
+  const double observe_seconds = secondsSince(start);
+  encoder.decode(encoder.encode(scene.input, o, progress), o.space, s.child_threshold, progress);
   const double observed_seconds = secondsSince(start);
-  add("observed", observed, observed_seconds, frame, states);
+  add("observed", observed, observed_seconds);
+
+  start = std::chrono::steady_clock::now();
+  std::vector<std::vector<uint8_t>> pixels;
+  for (const View& v : scene.input) pixels.push_back(observedPixels(v, o, c.seen.level, s.carving));
+  const MethodOutput aligned{pixelAligned(scene.input, pixels), o.tokens.coords(0)};
+  add("pixel-aligned", aligned, observe_seconds + secondsSince(start));
+  columns.pop_back();
 
   start = std::chrono::steady_clock::now();
   const MethodOutput nearest = nearestFill(observed, seen, states);
-  add("nearest", nearest, observed_seconds + secondsSince(start), frame, states);
+  add("nearest", nearest, observed_seconds + secondsSince(start));
   start = std::chrono::steady_clock::now();
   const MethodOutput box = manhattanBox(observed, seen, states);
-  add("box", box, observed_seconds + secondsSince(start), frame, states);
-  add("completed", {c.whole_decoded.gaussians, c.whole_decoded.voxels}, completed_seconds, frame, states);
+  add("box", box, observed_seconds + secondsSince(start));
+  add("completed", {c.whole_decoded.gaussians, c.whole_decoded.voxels}, completed_seconds);
   results.back().peak_rss_mb = completed_rss;
 
   if (scene.truth) {
-    resetPeakMemory();
+    results.back().reliability = reliabilityOf(c.whole, unseen.truth);
+    results.back().ece = calibrationError(*results.back().reliability);
     start = std::chrono::steady_clock::now();
-    const LatentGrid oracle = completer.completeAt(c.seen, c.observation.space,
+    const LatentGrid oracle = completer.completeAt(c.seen, c.space,
                                                    surfaceNodes(*scene.truth, frame, 1), s.completion, progress);
-    const DecodedGrid d = encoder.decode(oracle, c.observation.space, s.child_threshold, progress);
-    add("oracle-occupancy", {d.gaussians, d.voxels}, observed_seconds + secondsSince(start), frame, states);
+    const DecodedGrid d = encoder.decode(oracle, c.space, s.child_threshold, progress);
+    add("oracle-occupancy", {d.gaussians, d.voxels}, observed_seconds + secondsSince(start));
   }
+  if (!picture.empty()) writeColumns(columns, picture);
   return results;
 }
 
 std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results) {
-  std::vector<MethodResult> means = meanScores(results, kScores);
+  std::vector<MethodResult> means = summaries(results, kScores, "mean", meanOf);
   for (MethodResult& mean : means) {
     for (const MethodResult& r : results) {
       if (r.method != mean.method) continue;
       mean.features.insert(mean.features.end(), r.features.begin(), r.features.end());
       mean.true_features.insert(mean.true_features.end(), r.true_features.begin(), r.true_features.end());
+      if (!r.reliability) continue;
+      if (!mean.reliability) mean.reliability.emplace();
+      for (size_t i = 0; i < r.reliability->size(); ++i) {
+        ReliabilityBin& sum = (*mean.reliability)[i];
+        const ReliabilityBin& bin = (*r.reliability)[i];
+        sum.count += bin.count, sum.hits += bin.hits, sum.sum_probability += bin.sum_probability;
+      }
     }
     if (mean.features.size() < 2) continue;
     const Eigen::MatrixXd a = rowsOf(mean.true_features), b = rowsOf(mean.features);
@@ -325,6 +438,10 @@ std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results) 
     mean.features.clear(), mean.true_features.clear();
   }
   return means;
+}
+
+std::vector<MethodResult> deviationResults(const std::vector<MethodResult>& results) {
+  return summaries(results, kScores, "std", deviationOf);
 }
 
 }  // namespace vdbc

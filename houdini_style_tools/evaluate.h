@@ -1,5 +1,6 @@
 #pragma once
 // All methods and baselines on scenes that the networks never saw.
+#include <array>
 #include <functional>
 #include <limits>
 #include <memory>
@@ -17,13 +18,14 @@ namespace vdbc {
 /// Views of a room that are not input.
 constexpr int kTargetViews = 8;
 
-/// One scene to evaluate: input views, target views and, for procedural rooms, the truth.
+/// One scene to evaluate: input views, target views and, for rooms, the truth.
 struct EvaluationScene {
   std::string name;
   std::vector<View> input, targets;
   Eigen::Vector3d up = Eigen::Vector3d::UnitZ();
-  std::optional<TriangleMesh> truth;
+  std::optional<TriangleMesh> truth, shell;  // all solid surfaces, and those of the room itself (shellMesh)
   std::vector<Eigen::Vector3f> free_points;  // origins of leak rays; empty without truth
+  std::function<bool(const Eigen::Vector3f& p_world)> is_within;  // the room (isWithin); empty without truth
 };
 
 /// Scenes named by SPEC: `rooms:SEED-SEED` (or rooms:SEED), or a folder with transforms.json of which
@@ -37,13 +39,41 @@ SceneList sceneList(const std::string& spec, int views, const std::vector<int>& 
 
 /// A set of nodes against the true one; NaN is 0/0.
 struct SetScores {
-  double precision = 0, recall = 0, f1 = 0;
+  double precision = 0, recall = 0, f1 = 0, iou = 0;
 };
 SetScores setScores(const std::set<Coord>& filled, const std::set<Coord>& truth);
+
+/// How many of `filled`, nodes of level 1 of the frame's grid, lie outside the scene's room: they are not in `truth`, the
+/// nodes that its surfaces pass, and their centre is not over its floor and below its ceilings. What stands behind the
+/// shell, exactly; a false node in a cupboard is not outside, one in the next room of a home is.
+int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame, const std::set<Coord>& filled,
+                     const std::set<Coord>& truth);
+
+/// Generated nodes by their stored probability: bin i of ten holds [i, i + 1) / 10, the last one also 1.
+struct ReliabilityBin {
+  int64_t count = 0, hits = 0;  // hits: in the truth
+  double sum_probability = 0;
+};
+using Reliability = std::array<ReliabilityBin, 10>;
+/// Of the generated rows of `latents`; `truth` are nodes of their level.
+Reliability reliabilityOf(const LatentGrid& latents, const std::set<Coord>& truth);
+/// Expected calibration error: mean over the nodes of |share of hits - mean probability| of their bin (Naeini et al.
+/// 2015). NaN without nodes.
+double calibrationError(const Reliability& reliability);
 
 /// Share of rays from the free points of a scene with truth that meet none of `voxels` before they have
 /// passed the true surface by two voxels.
 double sceneLeak(const EvaluationScene& scene, const VoxelFrame& frame, const std::vector<Coord>& voxels);
+
+/// Adds an opaque-looking Gaussian of one colour: standard deviation sigma_m in all directions.
+void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vector3f& srgb, Gaussians* g);
+
+/// An opaque isotropic Gaussian at each pixel with a nonzero `observed` ([H * W] of each view), at its depth,
+/// as wide as its pixel. World frame.
+Gaussians pixelAligned(const std::vector<View>& views, const std::vector<std::vector<uint8_t>>& observed);
+
+/// Writes pictures as a PNG: a column a method, a row a view, all in the size of the first. Throws Error.
+void writeColumns(const std::vector<std::vector<Image>>& columns, const std::string& path);
 
 /// The user's own networks; null where there is none.
 struct UserNets {
@@ -65,20 +95,30 @@ struct MethodResult {
   // elsewhere and without a network.
   double fid = std::numeric_limits<double>::quiet_NaN(), kid = std::numeric_limits<double>::quiet_NaN();
   std::vector<std::vector<float>> features, true_features;  // one row a target view
-  double precision = 0, recall = 0, f1 = 0;  // 0.2 m nodes that were unobserved, against the true surface
+  // 0.2 m nodes that were unobserved, against the true surface; recall also of those that the room's shell
+  // passes and of the others, which only furniture passes. outside: outsideCount() of the filled ones.
+  double precision = 0, recall = 0, f1 = 0, iou = 0;
+  double shell_recall = 0, furniture_recall = 0, outside = 0;
+  double ece = std::numeric_limits<double>::quiet_NaN();  // calibrationError(); of `completed` only
+  std::optional<Reliability> reliability;                 // the same; of a mean the sums over its scenes
   double leak = 0;                  // share of rays from free space that pass the true surface
   double seconds = 0, peak_rss_mb = 0;
   int64_t gaussians = 0;
 };
-/// One JSON object, without the features.
+/// One JSON object, without features and reliability.
 std::string resultJson(const MethodResult& result);
+/// One JSON object: scene, views, method and, a bin, [count, sum of probabilities, hits].
+std::string reliabilityJson(const MethodResult& result);
 
-/// Methods: observed, nearest, box, completed, oracle-occupancy (rooms only).
+/// Methods: observed, pixel-aligned, nearest, box, completed, oracle-occupancy (rooms only). With a `picture` writes a
+/// PNG: of at most four target views the truth, then a column a method but pixel-aligned, which looks like observed.
 std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Encoder& encoder,
                                         const Completer& completer, const SceneSettings& settings,
-                                        Progress& progress, const UserNets& nets = {});
+                                        const std::string& picture, Progress& progress, const UserNets& nets = {});
 
 /// Mean over scenes of each method, scene "mean"; values that are NaN in a scene are left out there.
 std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results);
+/// Sample standard deviation over scenes of each method, scene "std"; NaN with fewer than two values.
+std::vector<MethodResult> deviationResults(const std::vector<MethodResult>& results);
 
 }  // namespace vdbc

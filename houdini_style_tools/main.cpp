@@ -4,6 +4,7 @@
 #include <tbb/global_control.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
@@ -12,12 +13,14 @@
 
 #include "encoder/encoder_train.h"
 #include "houdini_style_tools/blas.h"
+#include "houdini_style_tools/checkpoint.h"
 #include "houdini_style_tools/complete.h"
 #include "houdini_style_tools/console.h"
 #include "houdini_style_tools/reconstruct.h"
 #include "houdini_style_tools/render.h"
 #include "houdini_style_tools/scenes.h"
 #include "vdb/latent_vdb.h"
+#include "vdb/mask_vdb.h"
 
 namespace vdbc {
 namespace {
@@ -32,21 +35,28 @@ struct Common {
   bool json = false;
 };
 struct Complete {
-  std::string views, frames, output, weights;
+  std::string views, frames, output, weights, region, lock;
+  int from_level = 1, samples = 1;
+  bool resume = false;
   std::vector<double> up, bounds;
   double scale = 0;
   double margin = VolumeSettings().margin_m;
   double tau = CompleteSettings().tau, coarse_tau = CompleteSettings().coarse_tau;
+  double hole_tau = CompleteSettings().hole_tau;
   double child_tau = SceneSettings().child_threshold;
   double temperature = 1;
   int sampling_steps = 0;
-  bool refine_observed = false, antialias = false;
+  bool generated_context = false, refine_observed = false, antialias = false;
 };
 struct Render {
   RenderSettings settings;
   std::string frames;
   std::vector<int> size;
   std::vector<double> up;
+};
+struct Rethreshold {
+  std::string from, output;
+  double tau = 0;
 };
 struct Decode {
   std::string latents, output, weights;
@@ -114,8 +124,10 @@ SceneSettings sceneSettings(const Complete& o, const Common& common, const Eigen
       throw UsageError("--bounds: expected a box: x0 y0 z0 x1 y1 z1 with each second corner larger");
   }
   s.completion.tau = float(o.tau), s.completion.coarse_tau = float(o.coarse_tau);
+  s.completion.hole_tau = float(o.hole_tau);
   s.child_threshold = float(o.child_tau);
   s.completion.sampling_steps = o.sampling_steps, s.completion.temperature = o.temperature;
+  s.completion.generated_context = o.generated_context;
   s.completion.refine_observed = o.refine_observed;
   s.completion.seed = common.seed;
   return s;
@@ -178,37 +190,159 @@ SceneInput readScene(const Complete& o, const Common& common, const ReadViewsSet
   return {std::move(views), up, sceneSettings(o, common, up)};
 }
 
+bool endsWith(const std::string& text, const std::string& ending) {
+  return text.size() >= ending.size() && text.compare(text.size() - ending.size(), ending.size(), ending) == 0;
+}
+
+// Latents that this encoder made, of a place that it could have seen.
+LatentFile readLatents(const std::string& path, const Encoder& encoder, const std::string& weights) {
+  constexpr int64_t kMaxVoxels = int64_t(1) << 30;
+  LatentFile file = readLatentVdb(path);
+  require(file.encoder_hash == encoder.hash(), path, ": expected the weights ", file.encoder_hash,
+          " that made it, found ", encoder.hash(), " in ", weights, " (use --weights)");
+  require(file.growth.empty(), path, ": is a completion that was cut short (expected a finished one; --resume goes on)");
+  const VoxelFrame& frame = file.latents.frame;
+  const Coord size = frame.bounds.dim();
+  bool whole = true;  // nodes of all levels
+  for (int axis = 0; axis < 3; ++axis) whole = whole && frame.bounds.min()[axis] % 4 == 0 && size[axis] % 4 == 0;
+  require(frame.voxel_m == encoder.config().voxel_m && whole && int64_t(size.x()) * size.y() * size.z() <= kMaxVoxels,
+          path, ": expected voxels of ", encoder.config().voxel_m, " m and a volume of whole nodes and at most ", kMaxVoxels,
+          " voxels, found ", frame.voxel_m, " m and ", frame.bounds);
+  return file;
+}
+
+// Results would lie over what they were made of.
+void requireOtherName(const std::string& from, const std::string& ending, const std::string& stem) {
+  std::error_code none;
+  if (endsWith(from, ending) && fs::weakly_canonical(from, none) == fs::weakly_canonical(stem + ending, none))
+    throw UsageError(joinText("--output: ", stem, ".vdb: expected another name than that of ", from));
+}
+
+// Tokens that may be generated: those of --region, less those of --lock; null: all.
+std::shared_ptr<const TokenMask> allowedTokens(const Complete& o, const VoxelFrame& frame, const TokenMask& locked) {
+  if (o.region.empty() && o.lock.empty()) return nullptr;
+  auto allowed = std::make_shared<TokenMask>();
+  if (o.region.empty())
+    allowed->sparseFill(CoordBBox(tokenCoord(frame.bounds.min(), 1), tokenCoord(frame.bounds.max(), 1)), true, true);
+  else
+    allowed->topologyUnion(readTokenMask(o.region, frame, 1));
+  allowed->topologyDifference(locked);
+  return allowed;
+}
+
+// The n-th of several completions: X.vdb, X.2.vdb, X.3.vdb.
+constexpr const char* kOccupancyEnding = ".occupancy.vdb";
+std::string sampleStem(const std::string& stem, int n) { return n == 1 ? stem : joinText(stem, ".", n); }
+
+std::string checkpointOf(const std::string& stem) { return stem + ".checkpoint" + kLatentEnding; }
+
+// One completion from encoded tokens to files, checkpointed on the way.
+Completion cookSample(const SceneInput& in, LatentGrid start, const ObservedSpace& space, const Encoder& encoder,
+                      const Completer& completer, const std::string& stem, const Complete& o, Progress& progress) {
+  SceneSettings settings = in.settings;
+  const std::string checkpoint = checkpointOf(stem);
+  const std::string identity = completionIdentity(completer, start, settings.completion);
+  if (o.resume && fs::exists(checkpoint))
+    readCheckpoint(checkpoint, encoder.hash(), identity, &start, &settings.completion);
+  Completion c = naming(o.views, [&] {
+    return completeLatents(start, space, encoder, completer, settings, progress,
+                           [&](const LatentGrid& so_far, int32_t next_level) {
+                             writeCheckpoint(so_far, next_level, space, encoder.hash(), identity, checkpoint);
+                           });
+  });
+  for (DecodedGrid* d : {&c.seen_decoded, &c.whole_decoded}) d->gaussians.antialias = o.antialias;
+  writeCompletion(in.views, c, encoder.hash(), stem, in.up, progress);
+  fs::remove(checkpoint);
+  return c;
+}
+
 void cookComplete(const Complete& o, const Common& common, Progress& progress) {
+  const bool from_latents = endsWith(o.views, kLatentEnding);
   const ReadViewsSettings chosen = reading(o.frames, o.scale);
-  const std::string stem = outputStem(o.output);
+  const std::vector<std::string> more = from_latents ? std::vector<std::string>{kLatentEnding}
+                                                     : std::vector<std::string>{kLatentEnding, kPictureEnding};
+  const std::string stem = outputStem(o.output, more);
+  for (int n = 2; n <= o.samples; ++n) outputStem(sampleStem(stem, n) + ".vdb", more);
+  if (o.samples > 1) requireCreatable(stem + kOccupancyEnding);
+  requireOtherName(o.views, kLatentEnding, stem);
+  bool begun = !o.resume;
+  for (int n = 1; n <= o.samples; ++n) begun = begun || fs::exists(checkpointOf(sampleStem(stem, n)));
+  require(begun, "--resume: ", checkpointOf(stem), ": no such file (expected a run that was cut short)");
   const std::string weights = weightsFolder(o.weights);
-  const auto start = std::chrono::steady_clock::now();
+  const auto begin = std::chrono::steady_clock::now();
   progress.start("read");
-  const SceneInput in = readScene(o, common, chosen);
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
-  progress.end();
-  Completion c = naming(o.views, [&] { return completeScene(in.views, encoder, completer, in.settings, progress); });
-  for (DecodedGrid* d : {&c.seen_decoded, &c.whole_decoded}) d->gaussians.antialias = o.antialias;
-  writeCompletion(in.views, c, stem, in.up, progress);
-  const double seconds = secondsSince(start);
-  const int64_t observed = c.seen.size(), generated = c.whole.size() - observed;
-  const size_t voxels = c.whole_decoded.voxels.size();
-  const int64_t gaussians = c.whole_decoded.gaussians.size();
-  printSummary(common.json,
-               {{"views", in.views.size()}, {"observed_tokens", observed}, {"generated_tokens", generated},
-                {"voxels", voxels}, {"gaussians", gaussians}, {"seconds", seconds}, {"output", stem}},
-               joinText(in.views.size(), " views: ", observed, " tokens observed, ", generated, " generated; ", voxels,
-                        " voxels, ", gaussians, " Gaussians; ", std::round(seconds * 10) / 10, " s\n", stem, ".vdb  ",
-                        stem, ".points.vdb  ", stem, ".ply  ", stem, ".png"),
+  SceneInput in;
+  LatentFile encoded;
+  if (from_latents) {
+    LatentFile file = readLatents(o.views, encoder, weights);
+    in.up = file.latents.frame.world_from_grid.linear().col(2);
+    in.settings = sceneSettings(o, common, in.up);
+    encoded.latents = std::move(file.latents);
+    encoded.seen.filled.root() = file.seen.filled.root(), encoded.seen.empty.root() = file.seen.empty.root();
+    progress.end();
+  } else {
+    in = readScene(o, common, chosen);
+    progress.end();
+    const Encoding e = naming(o.views, [&] { return encodeScene(in.views, encoder, in.settings, progress); });
+    encoded.latents = e.latents;
+    encoded.seen.filled.root() = e.observation.space.filled.root();
+    encoded.seen.empty.root() = e.observation.space.empty.root();
+  }
+  const LatentGrid& all = encoded.latents;
+  require(o.from_level == 1 || std::count(all.bfs_level.begin(), all.bfs_level.end(), o.from_level - 1) > 0,
+          "--from-level: ", o.views, ": expected tokens of growth level ", o.from_level - 1, ", found none");
+  TokenMask locked;
+  if (!o.lock.empty()) locked.topologyUnion(readTokenMask(o.lock, all.frame, 1));
+  const LatentGrid start = keepTokens(all, [&](size_t i) {
+    return all.observed[i] || all.bfs_level[i] < o.from_level || locked.isValueOn(all.ijk[i]);
+  });
+  in.settings.completion.first_level = o.from_level;
+  in.settings.completion.region = allowedTokens(o, all.frame, locked);
+
+  std::vector<std::vector<Coord>> samples;
+  ordered_json made;
+  for (int n = 1; n <= o.samples; ++n) {
+    const Completion c =
+        cookSample(in, start, encoded.seen, encoder, completer, sampleStem(stem, n), o, progress);
+    if (n == 1)
+      made = {{"views", in.views.size()}, {"observed_tokens", c.seen.size()},
+              {"generated_tokens", c.whole.size() - c.seen.size()}, {"voxels", c.whole_decoded.voxels.size()},
+              {"gaussians", c.whole_decoded.gaussians.size()}};
+    samples.push_back(c.whole_decoded.voxels);
+    ++in.settings.completion.seed;
+  }
+  if (o.samples > 1) writeOccupancyVdb(all.frame, samples, stem + kOccupancyEnding);
+  const double seconds = secondsSince(begin);
+  made["seconds"] = seconds, made["output"] = stem;
+  std::string files = joinText(stem, ".vdb  ", stem, ".points.vdb  ", stem, ".ply  ", stem, kLatentEnding);
+  if (!from_latents) files += joinText("  ", stem, kPictureEnding);
+  if (o.samples > 1)
+    files += joinText("\nthe same of ", o.samples - 1, " more with other seeds: ", sampleStem(stem, 2), ".vdb ...; ", stem, kOccupancyEnding);
+  printSummary(common.json, made,
+               joinText(made["views"].dump(), " views: ", made["observed_tokens"].dump(), " tokens observed, ",
+                        made["generated_tokens"].dump(), " generated; ", made["voxels"].dump(), " voxels, ",
+                        made["gaussians"].dump(), " Gaussians; ", std::round(seconds * 10) / 10, " s\n", files),
                scaleJson(o));
 }
 
+void cookRethreshold(const Rethreshold& o, const Common& common, Progress& progress) {
+  const std::string stem = outputStem(o.output, {});
+  if (!endsWith(o.from, ".vdb") || endsWith(o.from, kLatentEnding))
+    throw UsageError(joinText("VOLUME: ", o.from, ": expected the X.vdb of a completion"));
+  requireOtherName(o.from, ".vdb", stem);
+  const Rethresholded r = rethreshold(o.from.substr(0, o.from.size() - 4), float(o.tau), stem, progress);
+  printSummary(common.json,
+               {{"voxels", r.voxels}, {"gaussians", r.gaussians}, {"dropped_voxels", r.dropped_voxels}, {"output", stem}},
+               joinText(r.voxels, " voxels, ", r.gaussians, " Gaussians; ", r.dropped_voxels, " voxels dropped\n", stem, ".vdb  ",
+                        stem, ".points.vdb  ", stem, ".ply\nA new run with this tau differs a little: the decoder, and the "
+                        "completer with --generated-context, look at neighbours that are gone here."));
+}
+
 void cookEncode(const Complete& o, const Common& common, Progress& progress) {
-  constexpr const char* kEnding = ".latent.vdb";
-  const std::string name = fs::path(o.output).filename().string(), ending = kEnding;
-  if (name.size() <= ending.size() || name.compare(name.size() - ending.size(), ending.size(), ending) != 0)
-    throw UsageError(joinText("--output: ", o.output, ": expected a name that ends in ", ending));
+  if (!endsWith(o.output, kLatentEnding) || fs::path(o.output).filename() == kLatentEnding)
+    throw UsageError(joinText("--output: ", o.output, ": expected a name that ends in ", kLatentEnding));
   const ReadViewsSettings chosen = reading(o.frames, o.scale);
   requireCreatable(o.output);
   const std::string weights = weightsFolder(o.weights);
@@ -219,7 +353,7 @@ void cookEncode(const Complete& o, const Common& common, Progress& progress) {
   progress.end();
   const Encoding e = naming(o.views, [&] { return encodeScene(in.views, encoder, in.settings, progress); });
   progress.start("write");
-  writeLatentVdb({e.latents, e.observation.space, encoder.hash()}, o.output);
+  writeLatentVdb({e.latents, e.observation.space, encoder.hash(), ""}, o.output);
   progress.end();
   const double seconds = secondsSince(start);
   printSummary(common.json,
@@ -230,14 +364,12 @@ void cookEncode(const Complete& o, const Common& common, Progress& progress) {
 }
 
 void cookDecode(const Decode& o, const Common& common, Progress& progress) {
-  const std::string stem = outputStem(o.output, false);
+  const std::string stem = outputStem(o.output, {});
   const std::string weights = weightsFolder(o.weights) + "/encoder.safetensors";
   const auto start = std::chrono::steady_clock::now();
   progress.start("read");
-  const LatentFile file = readLatentVdb(o.latents);
   const Encoder encoder(weights);
-  require(file.encoder_hash == encoder.hash(), "decode: ", o.latents, ": expected the weights ", file.encoder_hash,
-          " that made it, found ", encoder.hash(), " in ", weights, " (use --weights)");
+  const LatentFile file = naming("decode", [&] { return readLatents(o.latents, encoder, weights); });
   progress.end();
   progress.start("decode");
   DecodedGrid decoded = naming(o.latents, [&] {
@@ -315,6 +447,14 @@ void cookCheck(const Check& o, const Common& common) {
   }
 }
 
+// FOLDER/N.png of scene N, which can be created; "" where no pictures are wanted.
+std::string pictureOf(const Evaluate& o, int64_t scene) {
+  if (o.pictures.empty()) return "";
+  const std::string picture = joinText(o.pictures, "/", scene, ".png");
+  requireCreatable(picture);
+  return picture;
+}
+
 void cookEvaluate(const Evaluate& o, const Complete& options, const Common& common, Progress& progress) {
   const SceneList scenes = sceneList(o.scenes, o.views, frameList(o.frames), common.seed);
   UserNets nets;
@@ -328,28 +468,34 @@ void cookEvaluate(const Evaluate& o, const Complete& options, const Common& comm
   auto show = [&](const MethodResult& r) {
     if (common.json) {
       std::printf("%s\n", resultJson(r).c_str());
+      if (r.reliability) std::printf("%s\n", reliabilityJson(r).c_str());
     } else {
-      char perceived[96] = "";
+      char perceived[96] = "", calibrated[24] = "";
       int used = 0;
       if (nets.lpips) used = std::snprintf(perceived, sizeof perceived, "lpips %.3f  ", r.lpips);
       if (!std::isnan(r.fid))
         std::snprintf(perceived + used, sizeof perceived - size_t(used), "fid %.2f  kid %.4f  ", r.fid, r.kid);
-      std::printf("%-14s %-17s psnr %6.2f  ssim %.3f  flip %.3f  %sdepth %.3f m  precision %.3f  recall %.3f  f1 %.3f  leak %.3f  %6.2f s  %5.0f MB  %lld\n",
+      if (!std::isnan(r.ece)) std::snprintf(calibrated, sizeof calibrated, "ece %.3f  ", r.ece);
+      std::printf("%-14s %-17s psnr %6.2f  ssim %.3f  flip %.3f  %sdepth %.3f m  precision %.3f  recall %.3f (shell %.3f, furniture %.3f)  f1 %.3f  iou %.3f  outside %.0f  %sleak %.3f  %6.2f s  %5.0f MB  %lld\n",
                   r.scene.c_str(), r.method.c_str(), r.psnr, r.ssim, r.flip, perceived,
-                  r.depth_median_m, r.precision, r.recall, r.f1, r.leak, r.seconds,
-                  r.peak_rss_mb, static_cast<long long>(r.gaussians));
+                  r.depth_median_m, r.precision, r.recall, r.shell_recall, r.furniture_recall, r.f1, r.iou,
+                  r.outside, calibrated, r.leak, r.seconds, r.peak_rss_mb, static_cast<long long>(r.gaussians));
     }
     std::fflush(stdout);
   };
   for (int64_t i = 0; i < scenes.count; ++i) {
     const EvaluationScene scene = scenes.scene(i);
-    for (const MethodResult& r :
-         naming(scene.name, [&] { return evaluateScene(scene, encoder, completer, settings, progress, nets); })) {
+    const std::string picture = pictureOf(o, i);
+    for (const MethodResult& r : naming(scene.name, [&] {
+           return evaluateScene(scene, encoder, completer, settings, picture, progress, nets);
+         })) {
       show(r);
       all.push_back(r);
     }
   }
   for (const MethodResult& r : meanResults(all)) show(r);
+  if (scenes.count < 2) return;
+  for (const MethodResult& r : deviationResults(all)) show(r);
 }
 
 // RANK of WORLD_SIZE processes that meet at MASTER_ADDR:MASTER_PORT, the variables that torchrun sets.
@@ -388,8 +534,7 @@ void cookReconstruct(const Evaluate& o, const Complete& options, const Common& c
   };
   for (int64_t i = 0; i < scenes.count; ++i) {
     const EvaluationScene scene = scenes.scene(i);
-    const std::string picture = o.pictures.empty() ? "" : joinText(o.pictures, "/", i, ".png");
-    if (!picture.empty()) requireCreatable(picture);
+    const std::string picture = pictureOf(o, i);
     for (const ReconstructionResult& r : naming(scene.name, [&] {
            return evaluateReconstruction(scene, encoder, settings, o.optimise_seconds, picture, progress);
          })) {
@@ -480,17 +625,20 @@ void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
   s.validate_every = 1000;  // roll-outs take seconds each
   // Samples depend on the encoder: its hash names their folder.
   const std::string samples = s.work_folder + "/samples_" + encoder.hash();
-  auto source = [&](uint64_t first) {
-    return [&, first](uint64_t i) { return completionSample(encoder, first + i, t.cache, samples); };
+  auto source = [&](uint64_t first, int64_t rooms) {
+    return [&, first, rooms](uint64_t i) {
+      return completionSample(encoder, first + i % uint64_t(rooms), int(i / uint64_t(rooms)), t.cache, samples);
+    };
   };
+  const auto training = source(kTrainingSeed, t.scenes), validation = source(kValidationSeed, kValidationRooms);
+  const int64_t count = t.scenes * kSamplesPerRoom;
   progress.start("encode rooms");
-  for (int64_t i = 0; i < t.scenes; ++i) {
-    source(kTrainingSeed)(uint64_t(i));
-    report(progress, int(100 * i / t.scenes));
+  for (int64_t i = 0; i < count; ++i) {
+    training(uint64_t(i));
+    report(progress, int(100 * i / count));
   }
   progress.end();
-  trainCompleter(config, source(kTrainingSeed), t.scenes, source(kValidationSeed), kValidationRooms, s,
-                 trainListener(common.json), progress);
+  trainCompleter(config, training, count, validation, kValidationRooms, s, trainListener(common.json), progress);
 }
 
 // CLI::Range lets NaN pass.
@@ -536,7 +684,8 @@ void addWeights(CLI::App* app, std::string* weights) {
 void addViews(CLI::App* app, Complete* o, const char* output) {
   const bool required = app->get_parent() != nullptr;  // a verb may stand in for the main job's
   app->add_option("VIEWS", o->views,
-                  "folder with transforms.json, a transforms.json, EXR file(s) with Z or P, or pointmaps (.npz)")
+                  "folder with transforms.json, a transforms.json, EXR file(s) with Z or P, pointmaps (.npz), a level set or "
+                  "fog volume (.vdb), or, to complete, X.latent.vdb")
       ->required(required);
   app->add_option("--frames", o->frames, "which of the views, 0,3,5-9 say [all]");
   app->add_option("-o,--output", o->output, output)->required(required);
@@ -550,10 +699,33 @@ void addCompletion(CLI::App* app, Complete* o) {
   addMargin(app, o);
   app->add_option("--tau", o->tau, "a token is kept above this probability")->check(Between(0, 1))->capture_default_str();
   app->add_option("--coarse-tau", o->coarse_tau, "the same for the coarse gate")->check(Between(0, 1))->capture_default_str();
+  app->add_option("--hole-tau", o->hole_tau, "above this probability dropped tokens are taken back where they close a hole, 1 = none")
+      ->check(Between(0, 1))->capture_default_str();
   addChildTau(app, &o->child_tau);
   app->add_option("--sampling-steps", o->sampling_steps, "diffusion steps, 0 = the linear mean")->check(CLI::Range(0, 1000))->capture_default_str();
   app->add_option("--temperature", o->temperature, "of the diffusion head")->check(Between(0, 10))->capture_default_str();
+  app->add_flag("--generated-context", o->generated_context, "generated tokens are context of later levels, as in the paper");
   app->add_flag("--refine-observed", o->refine_observed, "let the completer rewrite observed latents");
+}
+
+// Completing a part, again, or several times.
+void addContinuation(CLI::App* app, Complete* o) {
+  app->add_option("--region", o->region, "MASK.vdb: nothing is generated outside of it [everywhere]");
+  app->add_option("--lock", o->lock, "MASK.vdb: nothing is generated in it, what X.latent.vdb has there stays");
+  auto* from_level = app->add_option("--from-level", o->from_level, "with X.latent.vdb: growth levels below stay, the rest is made anew")
+                         ->check(CLI::Range(1, 1 << 20))->capture_default_str();
+  auto* samples = app->add_option("--samples", o->samples, "completions, X.vdb, X.2.vdb, ..., with seeds that follow --seed, and X.occupancy.vdb")
+                      ->check(CLI::Range(1, 1000))->capture_default_str();
+  app->add_flag("--resume", o->resume, "go on from the last growth level of a run that was cut short");
+  app->callback([=] {
+    const bool latents = endsWith(o->views, kLatentEnding);
+    for (const char* of_views : {"--frames", "--up", "--bounds", "--margin", "--scale"})
+      if (latents && app->count(of_views)) throw UsageError(joinText(of_views, ": expected views, found latents: ", o->views));
+    if (from_level->count() && !latents) throw UsageError("--from-level: expected X.latent.vdb of a completion instead of views");
+    if (samples->count() && o->samples > 1 && !(o->sampling_steps > 0 && o->temperature > 0 && o->generated_context))
+      throw UsageError("--samples: expected --sampling-steps and --generated-context (and a temperature): without them all "
+                       "completions have the same occupancy");
+  });
 }
 
 void addRender(CLI::App* verb, Render* o) {
@@ -586,13 +758,14 @@ void addEvaluate(CLI::App* verb, Evaluate* o, Complete* options) {
   verb->add_option("--features", o->features, "your TorchScript network of one picture, for FID and KID [none]");
   addCompletion(verb, options);
   auto* reconstruct = verb->add_flag("--reconstruct", o->reconstruct, "no completion: what was observed, encoded and decoded, beside baselines");
-  for (const char* of_completion : {"--lpips", "--features", "--tau", "--coarse-tau", "--sampling-steps",
-                                    "--temperature", "--refine-observed"})
+  for (const char* of_completion : {"--lpips", "--features", "--tau", "--coarse-tau", "--hole-tau", "--sampling-steps",
+                                    "--temperature", "--generated-context", "--refine-observed"})
     reconstruct->excludes(verb->get_option(of_completion));
   verb->add_option("--optimise", o->optimise_seconds, "seconds a scene for the baseline of optimised Gaussians, 0 leaves it out")
       ->check(Between(0, 86400))->capture_default_str()->needs(reconstruct);
-  verb->add_option("--pictures", o->pictures, "folder for a picture a scene: truth, reconstruction, baselines [none]")
-      ->needs(reconstruct);
+  verb->add_option("--pictures", o->pictures,
+                   "folder for N.png of scene N; columns: truth, observed, nearest, box, completed, oracle occupancy "
+                   "(--reconstruct: truth, reconstruction, baselines) [none]");
   verb->callback([=] {
     if (o->reconstruct && !views->count()) o->views = kReconstructionViews;
   });
@@ -620,12 +793,13 @@ void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rat
 
 int run(int argc, char** argv) {
   CLI::App app{"Completes a place seen in a few RGB-D views as OpenVDB grids and 3-D Gaussians.\n"
-               "Without a verb: vdb_complete VIEWS -o X.vdb writes X.vdb, X.points.vdb, X.ply and X.png.",
+               "Without a verb: vdb_complete VIEWS -o X.vdb writes X.vdb, X.points.vdb, X.ply, X.latent.vdb and X.png.",
                "vdb_complete"};
   app.set_version_flag("--version", VDBC_VERSION);
   Common common;
   Complete complete, encode, eval_options;
   Decode decode;
+  Rethreshold rethreshold;
   Render render;
   Check check;
   Evaluate evaluate;
@@ -633,9 +807,10 @@ int run(int argc, char** argv) {
   app.require_subcommand(0, 1);
 
   addCommon(&app, &common);
-  addViews(&app, &complete, "X.vdb to write, with X.points.vdb, X.ply and X.png beside it");
+  addViews(&app, &complete, "X.vdb to write, with X.points.vdb, X.ply, X.latent.vdb and X.png beside it");
   addAntialias(&app, &complete.antialias);
   addCompletion(&app, &complete);
+  addContinuation(&app, &complete);
 
   CLI::App* info = app.add_subcommand("info", "BLAS, threads, speed and weights");
   CLI::App* verb_encode = app.add_subcommand("encode", "views as latents: a .latent.vdb for decode");
@@ -647,6 +822,10 @@ int run(int argc, char** argv) {
   addWeights(verb_decode, &decode.weights);
   addChildTau(verb_decode, &decode.child_tau);
   addAntialias(verb_decode, &decode.antialias);
+  CLI::App* verb_rethreshold = app.add_subcommand("rethreshold", "raises tau of a finished place, without the networks");
+  verb_rethreshold->add_option("VOLUME", rethreshold.from, "X.vdb, with X.points.vdb beside it")->required();
+  verb_rethreshold->add_option("--tau", rethreshold.tau, "generated voxels stay above this probability")->check(Between(0, 1))->required();
+  verb_rethreshold->add_option("-o,--output", rethreshold.output, "Y.vdb to write, with Y.points.vdb and Y.ply beside it")->required();
   CLI::App* verb_render = app.add_subcommand("render", "Gaussians as pictures: from given cameras, around them or along a flight");
   addRender(verb_render, &render);
   CLI::App* verb_check = app.add_subcommand("check", "depth agreement and open directions, by Embree");
@@ -663,7 +842,7 @@ int run(int argc, char** argv) {
   CLI::App* train_mar = verb_train->add_subcommand("mar", "the masked auto-regressive completer");
   addTrain(train_mar, &train, 8000, 400, 8e-4);
   train_mar->add_option("--encoder", train.encoder, "encoder weights")->required();
-  for (CLI::App* verb : {info, verb_encode, verb_decode, verb_render, verb_check, verb_eval, train_encoder, train_mar}) addCommon(verb, &common);
+  for (CLI::App* verb : {info, verb_encode, verb_decode, verb_rethreshold, verb_render, verb_check, verb_eval, train_encoder, train_mar}) addCommon(verb, &common);
 
   try {
     app.parse(argc, argv);
@@ -681,6 +860,8 @@ int run(int argc, char** argv) {
     cookEncode(encode, common, console);
   } else if (verb_decode->parsed()) {
     cookDecode(decode, common, console);
+  } else if (verb_rethreshold->parsed()) {
+    cookRethreshold(rethreshold, common, console);
   } else if (verb_render->parsed()) {
     cookRender(render, common, console);
   } else if (verb_check->parsed()) {

@@ -21,16 +21,7 @@ namespace {
 using Clock = std::chrono::steady_clock;
 using Mask = std::vector<uint8_t>;
 
-constexpr float kOpaqueLogit = 5;      // .993; the rasteriser stops at .99
 constexpr double kLeastObserved = .01;  // share of a view's pixels, below which it says nothing
-
-void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vector3f& srgb, Gaussians* g) {
-  g->mean.push_back(mean.cast<float>());
-  g->log_scale.push_back(Eigen::Vector3f::Constant(float(std::log(sigma_m))));
-  g->rotation.emplace_back(1, 0, 0, 0);
-  g->opacity_logit.push_back(kOpaqueLogit);
-  for (int c = 0; c < 3; ++c) g->sh.push_back((srgb[c] - .5f) / kSh0);
-}
 
 // Views and which of their pixels count.
 struct JudgedViews {
@@ -73,16 +64,6 @@ PictureError meanError(const JudgedViews& judged, const Gaussians& gaussians, si
 
 constexpr size_t kShownViews = 2;  // of each kind
 
-// One column a method, one row a view. Views may differ in size.
-void writeColumns(const std::vector<std::vector<Image>>& columns, const std::string& path) {
-  const int width = columns[0][0].width, height = columns[0][0].height;
-  Image sheet(width * int(columns.size()), height * int(columns[0].size()), 3);
-  for (size_t c = 0; c < columns.size(); ++c)
-    for (size_t r = 0; r < columns[c].size(); ++r)
-      pasteImage(resizeImage(columns[c][r], width, height), int(c) * width, int(r) * height, &sheet);
-  writePng(sheet, path);
-}
-
 template <typename T>
 Tensor parameterOf(const std::vector<T>& values, at::IntArrayRef shape) {
   Tensor t = torch::empty(shape);
@@ -111,7 +92,7 @@ const std::vector<Score<ReconstructionResult>> kScores = {
 std::string reconstructionJson(const ReconstructionResult& r) { return scoresJson(r, kScores); }
 
 std::vector<ReconstructionResult> meanReconstructions(const std::vector<ReconstructionResult>& results) {
-  return meanScores(results, kScores);
+  return summaries(results, kScores, "mean", meanOf);
 }
 
 Gaussians voxelMean(const Observation& o, int per_voxel) {
@@ -126,26 +107,6 @@ Gaussians voxelMean(const Observation& o, int per_voxel) {
     for (int i = 0; i < per_voxel; ++i)
       addIsotropic(o.frame.toWorld(Eigen::Vector3d(ijk.x(), ijk.y(), ijk.z()) + place.col(i).cast<double>()), sigma_m,
                    srgb, &g);
-  }
-  return g;
-}
-
-Gaussians pixelAligned(const std::vector<View>& views, const std::vector<Mask>& observed) {
-  // Of .3, .4, .5, .7, 1, 1.4 and 2 best on views that are not among the input of validation rooms 900000-900003,
-  // 12 views in (21.5 dB; .4: 21.4, .7: 21.3, 1: 20.8): wider blurs, narrower leaves gaps where surfaces slope.
-  constexpr double kSigmaPixels = .5;
-  Gaussians g;
-  for (size_t i = 0; i < views.size(); ++i) {
-    const View& v = views[i];
-    for (int y = 0; y < v.camera.height; ++y)
-      for (int x = 0; x < v.camera.width; ++x) {
-        const size_t p = size_t(y) * size_t(v.camera.width) + size_t(x);
-        if (!observed[i][p]) continue;
-        const double z = v.depth[p];
-        addIsotropic(v.camera.unproject(x + .5, y + .5, z),
-                     kSigmaPixels * z / std::sqrt(v.camera.fx * v.camera.fy),
-                     {v.colour.at(x, y, 0), v.colour.at(x, y, 1), v.colour.at(x, y, 2)}, &g);
-      }
   }
   return g;
 }

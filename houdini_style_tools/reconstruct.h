@@ -35,10 +35,6 @@ std::vector<ReconstructionResult> meanReconstructions(const std::vector<Reconstr
 /// divided by the cube root of M, of the mean colour of the voxel's pixels. World frame.
 Gaussians voxelMean(const Observation& observation, int per_voxel);
 
-/// An opaque isotropic Gaussian at each pixel with a nonzero `observed` ([H * W] of each view), at its depth,
-/// as wide as its pixel. World frame.
-Gaussians pixelAligned(const std::vector<View>& views, const std::vector<std::vector<uint8_t>>& observed);
-
 struct OptimiseSettings {
   double seconds = 30;  // of wall-clock; the last step may run over
   int64_t max_steps = int64_t(1) << 40;

@@ -47,15 +47,17 @@ VoxelFrame completionFrame(const std::vector<View>& views, const EncoderConfig& 
   return fitVolume(depth, volume, CarveSettings());
 }
 
-CompletionSample completionSample(const Encoder& encoder, uint64_t seed,
+CompletionSample completionSample(const Encoder& encoder, uint64_t seed, int choice,
                                   const std::string& cache_folder, const std::string& sample_folder) {
-  const std::string path = sample_folder + "/" + std::to_string(seed) + ".sample";
+  const std::string path = joinText(sample_folder, "/", seed, ".", choice, ".sample");
   if (fs::exists(path)) return readSample(path);
-  const std::vector<View> views = trainingViews(seed, cache_folder);
+  std::vector<View> views = trainingViews(seed, cache_folder);
+  const auto turn = std::ptrdiff_t(views.size()) * choice / kSamplesPerRoom;
+  std::rotate(views.begin(), views.begin() + turn, views.end());
   // The cameras are random already: the first n are a random choice. Two views are the hardest case
   // that is promised, so half of the samples have two.
   static constexpr size_t kCounts[] = {1, 2, 2, 2, 2, 3, 4, 6};
-  const size_t n = kCounts[seed % 8];
+  const size_t n = kCounts[(seed + 3 * uint64_t(choice)) % 8];
   const std::vector<View> few(views.begin(), views.begin() + std::ptrdiff_t(n));
   const VoxelFrame frame = completionFrame(few, encoder.config(), Eigen::Vector3d::UnitZ());
   Progress silent;

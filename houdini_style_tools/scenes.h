@@ -33,9 +33,12 @@ std::vector<View> trainingViews(uint64_t seed, const std::string& cache_folder);
 VoxelFrame completionFrame(const std::vector<View>& views, const EncoderConfig& config,
                            const Eigen::Vector3d& up);
 
-/// Sample of the completer's training: a room, 1-6 random condition views (2 most often) and all its
-/// views as target, encoded; kept in `sample_folder`.
-CompletionSample completionSample(const Encoder& encoder, uint64_t seed,
+/// How many samples of the completer's training a room gives.
+constexpr int kSamplesPerRoom = 2;
+
+/// Sample of the completer's training: a room, 1-6 random condition views (2 most often), others for each
+/// `choice` below kSamplesPerRoom, and all its views as target, encoded; kept in `sample_folder`.
+CompletionSample completionSample(const Encoder& encoder, uint64_t seed, int choice,
                                   const std::string& cache_folder, const std::string& sample_folder);
 
 }  // namespace vdbc

@@ -1,11 +1,13 @@
 #include "mar/completer.h"
 
 #include <algorithm>
+#include <cmath>
 #include <map>
 #include <nlohmann/json.hpp>
 #include <set>
 
 #include "encoder/weights.h"
+#include "mar/closing.h"
 #include "mar/network.h"
 
 namespace vdbc {
@@ -15,6 +17,7 @@ using nlohmann::json;
 CompleterConfig CompleterConfig::paper() {
   CompleterConfig c;
   c.preset = "paper";
+  c.latent_dim = 32, c.latent_groups = 8;
   c.width = 512, c.heads = 16, c.layers = 5;
   c.coarse_width = 512, c.coarse_heads = 16, c.coarse_layers = 2;
   c.diffusion_width = 512, c.paper_snr_weight = true;
@@ -76,174 +79,276 @@ CompleterConfig CompleterConfig::fromJson(const std::string& text, const std::st
   return c;
 }
 
+namespace {
+
+Eigen::Vector3d centreOf(const std::vector<Coord>& coords) {
+  Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+  for (const Coord& c : coords) sum += Eigen::Vector3d(c.x(), c.y(), c.z());
+  return sum / double(coords.size());
+}
+
+// Equal parts of at most `size`, of tokens that lie together.
+std::vector<std::vector<Coord>> chunksOf(const std::vector<Coord>& tokens, int64_t size) {
+  const Tensor order = zOrder(tokens);
+  const int64_t n = int64_t(tokens.size()), count = (n + size - 1) / size;
+  std::vector<std::vector<Coord>> chunks(static_cast<size_t>(count));
+  for (int64_t c = 0; c < count; ++c)
+    for (int64_t i = c * n / count; i < (c + 1) * n / count; ++i)
+      chunks[size_t(c)].push_back(tokens[size_t(order.data_ptr<int64_t>()[i])]);
+  return chunks;
+}
+
+// The states inside a box of voxels.
+NodeStates partOf(const NodeStates& s, const CoordBBox& voxels) {
+  NodeStates part;
+  part.level = s.level;
+  part.box = CoordBBox(tokenCoord(voxels.min(), s.level), tokenCoord(voxels.max(), s.level));
+  part.box.intersect(s.box);
+  for (auto node = part.box.begin(); node; ++node) part.states.push_back(s.at(*node));
+  return part;
+}
+
+}  // namespace
+
 struct Completer::Impl {
   std::shared_ptr<CompleterNet> net;
   std::string hash, trained_on;
 
-  // The growing grid: latents standardised, provenance beside them.
-  struct Growth {
+  // Tokens with predicted latents as files hold them, one tensor [., D] or more.
+  struct Tokens {
     std::vector<Coord> ijk;
-    Tensor z;  // [N, D] standardised
-    int64_t seeds = 0;
     std::vector<float> probability;
     std::vector<int32_t> level;
-  };
+    std::vector<Tensor> z;
 
-  Growth seed(const LatentGrid& seen) const {
-    const int d = net->config.latent_dim;
-    require(seen.level == 1 && seen.dim == d, "Completer: the latent grid: expected ", d,
-            " channels at level 1, found ", seen.dim, " at level ", seen.level);
-    require(seen.size() > 0, "Completer: the latent grid is empty (expected observed tokens)");
-    Growth g;
-    g.ijk = seen.ijk;
-    g.z = net->standardise(torch::tensor(seen.z).view({seen.size(), d}));
-    g.seeds = seen.size();
-    g.probability = seen.probability;
-    g.level = seen.bfs_level;
-    return g;
-  }
-
-  // Coarse probabilities of every coarse node with unseen content (1 where filled).
-  std::map<Coord, float> coarseGate(const SceneTokens& scene, const VoxelFrame& frame) const {
-    std::map<Coord, float> gate;
-    for (const Coord& c : scene.coarse_filled) gate[c] = 1;
-    const std::vector<Coord>& unknown = scene.coarse_unknown;
-    const Tensor order = zOrder(unknown);
-    const int64_t n = int64_t(unknown.size()), size = net->config.coarse_chunk_tokens;
-    const int64_t chunks = (n + size - 1) / size;
-    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-      std::vector<Coord> targets;
-      for (int64_t i = chunk * n / chunks; i < (chunk + 1) * n / chunks; ++i)
-        targets.push_back(unknown[size_t(order.data_ptr<int64_t>()[i])]);
-      const Tensor p = net->coarseLogits(coarseInputs(scene, {}, targets, net->config.coarse_empty_tokens), frame)
-                           .sigmoid().contiguous();
-      for (size_t i = 0; i < targets.size(); ++i) gate[targets[i]] = p.data_ptr<float>()[i];
+    void add(const Tokens& from, const std::vector<int64_t>& rows) {
+      for (int64_t row : rows) {
+        ijk.push_back(from.ijk[size_t(row)]);
+        probability.push_back(from.probability[size_t(row)]);
+        level.push_back(from.level[size_t(row)]);
+      }
+      z.push_back(torch::cat(from.z).index_select(0, torch::tensor(rows, torch::kInt64)));
     }
-    return gate;
+  };
+
+  // Standardised predictions as a file will hold them: a run that goes on from one sees the same numbers.
+  Tensor asFiled(const Tensor& z) const {
+    return net->restore(net->project(z)).to(torch::kHalf).to(torch::kFloat32).contiguous();
   }
 
-  struct Prediction {
-    Tensor probability;  // [n]
-    Tensor z;            // [n, D] standardised
+  // The growing grid, observed rows first; `z` [N, D] has its latents standardised.
+  struct Growth {
+    LatentGrid grid;
+    Tensor z;
+    std::vector<Coord> observed;
+
+    int64_t seeds() const { return int64_t(observed.size()); }
+
+    void append(const Tokens& t, CompleterNet& net) {
+      const Tensor latents = torch::cat(t.z).contiguous();
+      z = torch::cat({z, net.standardise(latents)});
+      grid.ijk.insert(grid.ijk.end(), t.ijk.begin(), t.ijk.end());
+      grid.z.insert(grid.z.end(), latents.data_ptr<float>(), latents.data_ptr<float>() + latents.numel());
+      grid.observed.resize(grid.ijk.size(), 0);
+      grid.probability.insert(grid.probability.end(), t.probability.begin(), t.probability.end());
+      grid.bfs_level.insert(grid.bfs_level.end(), t.level.begin(), t.level.end());
+    }
   };
+
+  Growth begin(const LatentGrid& start, const CompleteSettings& s, Tokens* dropped) const {
+    const int d = net->config.latent_dim;
+    require(start.level == 1 && start.dim == d, "Completer: the latent grid: expected ", d,
+            " channels at level 1, found ", start.dim, " at level ", start.level);
+    const auto seeds = std::count(start.observed.begin(), start.observed.end(), 1);
+    const std::vector<Coord> observed(start.ijk.begin(), start.ijk.begin() + seeds);
+    require(seeds > 0, "Completer: the latent grid is empty (expected observed tokens)");
+    require(std::is_sorted(start.observed.rbegin(), start.observed.rend()),
+            "Completer: the latent grid: expected observed tokens before generated ones");
+    const Tensor z = torch::tensor(start.z).view({start.size(), d});
+    auto stays = [&](size_t i) { return !s.resumed || start.observed[i] || start.probability[i] > s.tau; };
+    std::vector<int64_t> rows[2];
+    for (int64_t i = 0; i < start.size(); ++i) rows[stays(size_t(i))].push_back(i);
+    dropped->add({start.ijk, start.probability, start.bfs_level, {z}}, rows[0]);
+    return {keepTokens(start, stays), net->standardise(z.index_select(0, torch::tensor(rows[1]))), observed};
+  }
+
+  // A part of the volume that the networks look at as one: what it decides, and the frame with its
+  // surroundings, from whose middle positions are measured.
+  struct Window {
+    CoordBBox core;  // voxels
+    VoxelFrame frame;
+  };
+
+  static std::vector<Window> windowsOf(const VoxelFrame& whole) {
+    constexpr double kWindowM = 12.8, kOverlapM = 1.6;  // what the position code was trained for
+    const int overlap = int(std::lround(kOverlapM / whole.voxel_m / 4)) * 4;
+    std::array<std::vector<int>, 3> cuts;  // first voxel of each part and the end
+    for (int axis = 0; axis < 3; ++axis) {
+      const int begin = whole.bounds.min()[axis], side = whole.bounds.dim()[axis];
+      const double side_m = side * double(whole.voxel_m);
+      const int parts = side_m <= kWindowM ? 1 : int(std::ceil(side_m / (kWindowM - 2 * kOverlapM)));
+      for (int part = 0; part < parts; ++part)
+        cuts[size_t(axis)].push_back(part ? (begin + int(int64_t(side) * part / parts)) & ~3 : begin);
+      cuts[size_t(axis)].push_back(begin + side);
+    }
+    std::vector<Window> windows;
+    for (size_t x = 0; x + 1 < cuts[0].size(); ++x)
+      for (size_t y = 0; y + 1 < cuts[1].size(); ++y)
+        for (size_t z = 0; z + 1 < cuts[2].size(); ++z) {
+          Window w{CoordBBox(Coord(cuts[0][x], cuts[1][y], cuts[2][z]),
+                             Coord(cuts[0][x + 1] - 1, cuts[1][y + 1] - 1, cuts[2][z + 1] - 1)), whole};
+          w.frame.bounds = w.core;
+          w.frame.bounds.expand(overlap);
+          w.frame.bounds.intersect(whole.bounds);
+          windows.push_back(w);
+        }
+    return windows;
+  }
+
+  // What is known, and the coarse stage's probability of every coarse node with unseen content (1 where filled).
+  struct Scene {
+    SceneTokens tokens;
+    std::vector<Window> windows;
+    std::map<Coord, float> gate;
+
+    size_t windowOf(const Coord& node) const {
+      for (size_t w = 0; w < windows.size(); ++w)
+        if (windows[w].core.isInside(Coord(2 * node.x(), 2 * node.y(), 2 * node.z()))) return w;
+      return 0;
+    }
+  };
+
+  static Scene sceneOf(const LatentGrid& start, const ObservedSpace& space) {
+    return {sceneTokens(poolStates(start.frame, space, 1), poolStates(start.frame, space, 2)), windowsOf(start.frame), {}};
+  }
+
+  void openGate(Scene* scene) const {
+    for (const Coord& c : scene->tokens.coarse_filled) scene->gate[c] = 1;
+    for (const Window& w : scene->windows) {
+      const SceneTokens part = sceneTokens(partOf(scene->tokens.nodes, w.frame.bounds),
+                                           partOf(scene->tokens.coarse, w.frame.bounds));
+      if (part.coarse_filled.empty()) continue;  // nothing to grow from
+      std::vector<Coord> unknown;
+      for (const Coord& c : part.coarse_unknown)
+        if (w.core.isInside(Coord(c.x() * 4, c.y() * 4, c.z() * 4))) unknown.push_back(c);
+      for (const std::vector<Coord>& targets : chunksOf(unknown, net->config.coarse_chunk_tokens)) {
+        const Tensor p = net->coarseLogits(coarseInputs(part, {}, targets, net->config.coarse_empty_tokens), w.frame)
+                             .sigmoid().contiguous();
+        for (size_t i = 0; i < targets.size(); ++i) scene->gate[targets[i]] = p.data_ptr<float>()[i];
+      }
+    }
+  }
 
   // One chunk: targets that lie close together, with what is nearest to them as context.
-  Prediction predict(const Growth& g, const SceneTokens& scene, const std::map<Coord, float>& gate,
-                     const std::vector<Coord>& targets, const VoxelFrame& frame,
-                     const CompleteSettings& s, torch::Generator& random) const {
-    Eigen::Vector3d centre = Eigen::Vector3d::Zero();
-    for (const Coord& c : targets) centre += Eigen::Vector3d(c.x(), c.y(), c.z());
-    centre /= double(targets.size());
+  Tokens predict(const Growth& g, const Scene& scene, const std::vector<Coord>& targets, int32_t level,
+                 const CompleteSettings& s, torch::Generator& random) const {
+    const Eigen::Vector3d centre = centreOf(targets);
     std::array<TokenSet, kTokenKinds> in;
     std::vector<int64_t> rows[2];
-    for (int64_t row : nearestRows(g.ijk, centre, net->config.context_tokens)) {
-      const int kind = row >= g.seeds;
+    const std::vector<Coord>& context = s.generated_context ? g.grid.ijk : g.observed;
+    for (int64_t row : nearestRows(context, centre, net->config.context_tokens)) {
+      const int kind = row >= g.seeds();
       rows[kind].push_back(row);
-      in[size_t(kind)].coords.push_back(g.ijk[size_t(row)]);
+      in[size_t(kind)].coords.push_back(context[size_t(row)]);
     }
     for (size_t kind = 0; kind < 2; ++kind)
       in[kind].features = g.z.index_select(0, torch::tensor(rows[kind], torch::kInt64));
-    for (int64_t row : nearestRows(scene.empty_shell, centre, net->config.empty_tokens))
-      in[kEmptyToken].coords.push_back(scene.empty_shell[size_t(row)]);
+    for (int64_t row : nearestRows(scene.tokens.empty_shell, centre, net->config.empty_tokens))
+      in[kEmptyToken].coords.push_back(scene.tokens.empty_shell[size_t(row)]);
     in[kTarget].coords = targets;
     std::vector<float> parent_probability;
     for (const Coord& c : targets) {
-      const auto found = gate.find(tokenCoord(c, 1));
-      parent_probability.push_back(found == gate.end() ? 0.f : found->second);
+      const auto found = scene.gate.find(tokenCoord(c, 1));
+      parent_probability.push_back(found == scene.gate.end() ? 0.f : found->second);
     }
     in[kTarget].features = torch::tensor(parent_probability).unsqueeze(1);
-    const CompleterNet::Fine f = net->fine(in, frame);
-    return {f.logits.sigmoid(),
-            net->project(net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random))};
+    const CompleterNet::Fine f = net->fine(in, scene.windows[scene.windowOf(in[kTarget].coords[0])].frame);
+    const Tensor p = f.logits.sigmoid().contiguous();
+    return {targets,
+            {p.data_ptr<float>(), p.data_ptr<float>() + p.numel()},
+            std::vector<int32_t>(targets.size(), level),
+            {asFiled(net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random))}};
   }
 
-  // Visits candidates level by level; keeps those that `keep` accepts given their probability.
+  // Visits candidates level by level; keeps those that `keep` accepts given their probability, the others
+  // are added to `dropped`. Levels are distances from what was observed, whatever of them is done already or may
+  // not be generated.
   template <typename Keep>
-  void grow(Growth* g, const SceneTokens& scene, const std::map<Coord, float>& gate,
-            const std::vector<Coord>& candidates, const VoxelFrame& frame, const CompleteSettings& s,
-            Keep keep, Progress& progress) const {
-    torch::Generator random = at::detail::createCPUGenerator(s.seed);
-    const std::vector<int32_t> levels = breadthFirstLevels(candidates, g->ijk, s.neighbours);
+  void grow(Growth* g, Tokens* dropped, const Scene& scene, const std::vector<Coord>& candidates,
+            const CompleteSettings& s, Keep keep, Progress& progress, const LevelListener& listener) const {
+    const std::set<Coord> done(g->grid.ijk.begin() + g->seeds(), g->grid.ijk.end());
+    const std::vector<int32_t> levels = breadthFirstLevels(candidates, g->observed, s.neighbours);
     const int32_t last = levels.empty() ? 0 : *std::max_element(levels.begin(), levels.end());
-    for (int32_t level = 1; level <= last; ++level) {
+    for (int32_t level = std::max(1, s.first_level); level <= last; ++level) {
       report(progress, int(100 * (level - 1) / last));
-      std::vector<Coord> frontier;
+      // A generator a level: a run that goes on from a level draws what the whole one would have drawn.
+      torch::Generator random = at::detail::createCPUGenerator(s.seed * 1000003 + uint64_t(level));
+      std::vector<std::vector<Coord>> frontier(scene.windows.size());
       for (size_t i = 0; i < candidates.size(); ++i)
-        if (levels[i] == level) frontier.push_back(candidates[i]);
-      if (frontier.empty()) continue;
-      const Tensor order = zOrder(frontier);
-      const int64_t n = int64_t(frontier.size());
-      const int64_t chunks = (n + net->config.chunk_tokens - 1) / net->config.chunk_tokens;
-      std::vector<Coord> kept;
-      std::vector<float> kept_probability;
-      std::vector<Tensor> kept_z;
-      for (int64_t c = 0; c < chunks; ++c) {
-        report(progress, -1);
-        std::vector<Coord> targets;
-        for (int64_t i = c * n / chunks; i < (c + 1) * n / chunks; ++i)
-          targets.push_back(frontier[size_t(order.data_ptr<int64_t>()[i])]);
-        const Prediction p = predict(*g, scene, gate, targets, frame, s, random);
-        const Tensor probability = p.probability.contiguous();
-        std::vector<int64_t> rows;
-        for (size_t i = 0; i < targets.size(); ++i) {
-          const float chance = probability.data_ptr<float>()[i];
-          if (!keep(chance)) continue;
-          rows.push_back(int64_t(i));
-          kept.push_back(targets[i]);
-          kept_probability.push_back(chance);
+        if (levels[i] == level && !done.count(candidates[i]) && (!s.region || s.region->isValueOn(candidates[i])))
+          frontier[scene.windowOf(candidates[i])].push_back(candidates[i]);
+      Tokens kept;
+      for (const std::vector<Coord>& part : frontier)
+        for (const std::vector<Coord>& targets : chunksOf(part, net->config.chunk_tokens)) {
+          report(progress, -1);
+          const Tokens p = predict(*g, scene, targets, level, s, random);
+          std::vector<int64_t> rows[2];
+          for (size_t i = 0; i < targets.size(); ++i) rows[keep(p.probability[i])].push_back(int64_t(i));
+          dropped->add(p, rows[0]), kept.add(p, rows[1]);
         }
-        kept_z.push_back(p.z.index_select(0, torch::tensor(rows, torch::kInt64)));
-      }
+      if (kept.z.empty()) continue;
       // Only now: every chunk of a level saw the same context.
-      g->z = torch::cat({g->z, torch::cat(kept_z)});
-      g->ijk.insert(g->ijk.end(), kept.begin(), kept.end());
-      g->probability.insert(g->probability.end(), kept_probability.begin(), kept_probability.end());
-      g->level.insert(g->level.end(), kept.size(), level);
+      g->append(kept, *net);
+      if (!listener) continue;
+      Growth all = *g;
+      if (s.hole_tau < s.tau) all.append(*dropped, *net);  // closing holes asks for them
+      listener(all.grid, level + 1);
     }
+  }
+
+  // Takes dropped tokens back where they close a hole.
+  void closeHoles(Growth* g, const Scene& scene, const Tokens& dropped, float least) const {
+    std::map<Coord, float> probability;
+    std::map<Coord, int64_t> row;
+    for (size_t i = 0; i < dropped.ijk.size(); ++i)
+      probability[dropped.ijk[i]] = dropped.probability[i], row[dropped.ijk[i]] = int64_t(i);
+    std::vector<int64_t> rows;
+    for (const Coord& c : closingTokens(scene.tokens.nodes, g->grid.ijk, probability, least)) rows.push_back(row.at(c));
+    if (rows.empty()) return;
+    Tokens closing;
+    closing.add(dropped, rows);
+    g->append(closing, *net);
   }
 
   // Condition latents rewritten from everything that was decoded (spec A8), chunk by chunk.
-  void refine(Growth* g, const SceneTokens& scene, const VoxelFrame& frame, const CompleteSettings& s) const {
+  void refine(Growth* g, const Scene& scene, const CompleteSettings& s) const {
     torch::Generator random = at::detail::createCPUGenerator(s.seed + 1);
-    const Tensor order = zOrder(std::vector<Coord>(g->ijk.begin(), g->ijk.begin() + g->seeds));
-    const Tensor before = g->z.clone();
+    const std::vector<Coord>& ijk = g->grid.ijk;
+    const int64_t seeds = g->seeds();
+    const Tensor order = zOrder(g->observed);
+    const std::vector<Coord> generated(ijk.begin() + seeds, ijk.end());
+    Tensor refined = g->z.slice(0, 0, seeds).clone();
     const int64_t chunk = net->config.chunk_tokens;
-    for (int64_t begin = 0; begin < g->seeds; begin += chunk) {
-      const Tensor rows = order.slice(0, begin, std::min(g->seeds, begin + chunk));
+    for (int64_t begin = 0; begin < seeds; begin += chunk) {
+      const Tensor rows = order.slice(0, begin, std::min(seeds, begin + chunk));
       std::array<TokenSet, kTokenKinds> in;
-      Eigen::Vector3d centre = Eigen::Vector3d::Zero();
-      for (int64_t i = 0; i < rows.size(0); ++i) {
-        const Coord c = g->ijk[size_t(rows[i].item<int64_t>())];
-        in[kCondition].coords.push_back(c);
-        centre += Eigen::Vector3d(c.x(), c.y(), c.z());
-      }
-      centre /= double(rows.size(0));
-      in[kCondition].features = before.index_select(0, rows);
-      const std::vector<Coord> generated(g->ijk.begin() + g->seeds, g->ijk.end());
+      for (int64_t i = 0; i < rows.size(0); ++i) in[kCondition].coords.push_back(ijk[size_t(rows[i].item<int64_t>())]);
+      const Eigen::Vector3d centre = centreOf(in[kCondition].coords);
+      in[kCondition].features = g->z.index_select(0, rows);
       std::vector<int64_t> near = nearestRows(generated, centre, net->config.context_tokens);
       for (int64_t& row : near) {
         in[kVisible].coords.push_back(generated[size_t(row)]);
-        row += g->seeds;
+        row += seeds;
       }
-      in[kVisible].features = before.index_select(0, torch::tensor(near, torch::kInt64));
-      for (int64_t row : nearestRows(scene.empty_shell, centre, net->config.empty_tokens))
-        in[kEmptyToken].coords.push_back(scene.empty_shell[size_t(row)]);
+      in[kVisible].features = g->z.index_select(0, torch::tensor(near, torch::kInt64));
+      for (int64_t row : nearestRows(scene.tokens.empty_shell, centre, net->config.empty_tokens))
+        in[kEmptyToken].coords.push_back(scene.tokens.empty_shell[size_t(row)]);
       in[kTarget].features = torch::zeros({0, 1});
-      const CompleterNet::Fine f = net->fine(in, frame);
-      g->z.index_copy_(0, rows, net->project(net->refinement->sample(f.conditions, s.sampling_steps, s.temperature, random)));
+      const CompleterNet::Fine f = net->fine(in, scene.windows[scene.windowOf(in[kCondition].coords[0])].frame);
+      refined.index_copy_(0, rows, net->project(net->refinement->sample(f.conditions, s.sampling_steps, s.temperature, random)));
     }
-  }
-
-  // Rows of `seen` first, exactly as they were unless refined.
-  LatentGrid result(const Growth& g, const LatentGrid& seen, bool refined) const {
-    LatentGrid out = seen;
-    const Tensor z = net->restore(g.z).contiguous();
-    const int64_t first = refined ? 0 : g.seeds;
-    out.z.resize(size_t(first) * size_t(out.dim));
-    out.z.insert(out.z.end(), z.data_ptr<float>() + first * out.dim, z.data_ptr<float>() + z.numel());
-    out.ijk = g.ijk, out.probability = g.probability, out.bfs_level = g.level;
-    out.observed.resize(g.ijk.size(), 0);
-    return out;
+    const Tensor z = net->restore(refined).to(torch::kHalf).to(torch::kFloat32).contiguous();
+    std::copy_n(z.data_ptr<float>(), z.numel(), g->grid.z.begin());
   }
 };
 
@@ -266,21 +371,23 @@ const CompleterConfig& Completer::config() const { return impl_->net->config; }
 std::string Completer::hash() const { return impl_->hash; }
 std::string Completer::trainedOn() const { return impl_->trained_on; }
 
-LatentGrid Completer::complete(const LatentGrid& seen, const ObservedSpace& space,
-                               const CompleteSettings& s, Progress& progress) const {
+LatentGrid Completer::complete(const LatentGrid& start, const ObservedSpace& space, const CompleteSettings& s,
+                               Progress& progress, const LevelListener& listener) const {
   torch::NoGradGuard no_grad;
   progress.start("complete");
-  Impl::Growth g = impl_->seed(seen);
-  const SceneTokens scene = sceneTokens(poolStates(seen.frame, space, 1), poolStates(seen.frame, space, 2));
-  const auto gate = impl_->coarseGate(scene, seen.frame);
+  Impl::Tokens dropped;
+  Impl::Growth g = impl_->begin(start, s, &dropped);
+  Impl::Scene scene = Impl::sceneOf(start, space);
+  impl_->openGate(&scene);
   std::vector<Coord> open;
-  for (const auto& [node, probability] : gate)
+  for (const auto& [node, probability] : scene.gate)
     if (probability > s.coarse_tau) open.push_back(node);
-  impl_->grow(&g, scene, gate, unobservedChildren(open, scene.nodes), seen.frame, s,
-              [&](float probability) { return probability > s.tau; }, progress);
-  if (s.refine_observed) impl_->refine(&g, scene, seen.frame, s);
+  impl_->grow(&g, &dropped, scene, unobservedChildren(open, scene.tokens.nodes), s,
+              [&](float probability) { return probability > s.tau; }, progress, listener);
+  if (s.hole_tau < s.tau) impl_->closeHoles(&g, scene, dropped, s.hole_tau);
+  if (s.refine_observed) impl_->refine(&g, scene, s);
   progress.end();
-  return impl_->result(g, seen, s.refine_observed);
+  return std::move(g.grid);
 }
 
 LatentGrid Completer::completeAt(const LatentGrid& seen, const ObservedSpace& space,
@@ -288,18 +395,18 @@ LatentGrid Completer::completeAt(const LatentGrid& seen, const ObservedSpace& sp
                                  Progress& progress) const {
   torch::NoGradGuard no_grad;
   progress.start("complete");
-  Impl::Growth g = impl_->seed(seen);
-  const SceneTokens scene = sceneTokens(poolStates(seen.frame, space, 1), poolStates(seen.frame, space, 2));
-  std::map<Coord, float> gate;
+  Impl::Tokens dropped;
+  Impl::Growth g = impl_->begin(seen, s, &dropped);
+  Impl::Scene scene = Impl::sceneOf(seen, space);
   std::vector<Coord> candidates;
   for (const Coord& c : std::set<Coord>(occupied.begin(), occupied.end())) {
-    if (scene.nodes.at(c) != NodeState::kUnobserved) continue;
+    if (scene.tokens.nodes.at(c) != NodeState::kUnobserved) continue;
     candidates.push_back(c);
-    gate[tokenCoord(c, 1)] = 1;
+    scene.gate[tokenCoord(c, 1)] = 1;
   }
-  impl_->grow(&g, scene, gate, candidates, seen.frame, s, [](float) { return true; }, progress);
+  impl_->grow(&g, &dropped, scene, candidates, s, [](float) { return true; }, progress, nullptr);
   progress.end();
-  return impl_->result(g, seen, false);
+  return std::move(g.grid);
 }
 
 }  // namespace vdbc

@@ -1,6 +1,7 @@
 #pragma once
 // The masked auto-regressive completer: which unseen tokens are occupied, and with which latents
 // (paper sec. 4, spec A1-A14).
+#include <functional>
 #include <memory>
 #include <string>
 
@@ -12,7 +13,7 @@ namespace vdbc {
 /// Every size of the completer; saved inside the weights file.
 struct CompleterConfig {
   std::string preset = "small";
-  int latent_dim = 32, latent_groups = 8;               // as the encoder's (spec E10)
+  int latent_dim = 64, latent_groups = 1;               // as the encoder's (spec E10)
   int width = 128, heads = 4, layers = 3;               // fine stage; layers each in H1 and H2
   int coarse_width = 96, coarse_heads = 3, coarse_layers = 2;  // coarse stage, one tree level up
   int diffusion_width = 256, diffusion_steps = 1000, diffusion_draws = 2;
@@ -33,14 +34,30 @@ struct CompleterConfig {
 };
 
 struct CompleteSettings {
-  float tau = .15f;           // a token is kept if its occupancy probability exceeds this
+  float tau = .4f;           // a token is kept if its occupancy probability exceeds this
   float coarse_tau = .05f;   // the coarse stage's gate: high recall
+  /// Dropped tokens above this probability are taken back where they close a hole (a minimum cut between
+  /// what was seen empty and the border of the volume); 1: none.
+  float hole_tau = .05f;
   Neighbours neighbours = Neighbours::kCorners26;
   int sampling_steps = 0;    // DDIM steps of the diffusion head; 0: its linear mean
   double temperature = 1;
+  /// Generated tokens are context of the levels after them (A11), not only the observed ones.
+  bool generated_context = false;
   bool refine_observed = false;  // rewrite condition latents with the refinement head (A8)
   uint64_t seed = 1;
+  /// Tokens (coordinates of the latents' level) that may be generated; all where null.
+  std::shared_ptr<const TokenMask> region;
+  /// Growth levels below it are taken as done.
+  int32_t first_level = 1;
+  /// `start` is a LevelListener's: generated tokens that do not exceed tau were dropped.
+  bool resumed = false;
 };
+
+/// Called after each growth level with all tokens so far (dropped ones too, if holes are to be closed) and
+/// the level that comes next. Completing those tokens from that level on, `resumed`, gives, bit by bit,
+/// what the uninterrupted run gives.
+using LevelListener = std::function<void(const LatentGrid& so_far, int32_t next_level)>;
 
 /// Trained networks, loaded once.
 class Completer {
@@ -55,11 +72,15 @@ class Completer {
   /// The scenes it was trained on, as the file says (`rooms:SEED-SEED`).
   std::string trainedOn() const;
 
-  /// `seen` plus generated tokens: coarse gate, then growth level by level (A10-A13). Rows of `seen`
-  /// come first, bit-identical unless refine_observed. `space` says what was seen empty; tokens that
-  /// are F or E in it are never visited. Same seed and threads, same grid.
-  LatentGrid complete(const LatentGrid& seen, const ObservedSpace& space,
-                      const CompleteSettings& settings, Progress& progress) const;
+  /// `start` plus generated tokens: coarse gate, then growth level by level (A10-A13). `start` has
+  /// observed tokens first; generated ones after them stay as they are and are not visited
+  /// again. Its rows come first, bit-identical unless refine_observed; generated latents are rounded
+  /// to half precision, so that files hold them exactly. `space` says what was seen empty; tokens that
+  /// are F or E in it are never visited. Places beyond 12.8 m are looked at in overlapping windows, by
+  /// the coarse stage and by the position code; windows without anything filled stay as they are. Same seed and threads, same grid.
+  LatentGrid complete(const LatentGrid& start, const ObservedSpace& space,
+                      const CompleteSettings& settings, Progress& progress,
+                      const LevelListener& listener = nullptr) const;
 
   /// The same with given occupancy: latents for `occupied` tokens (spec: oracle).
   LatentGrid completeAt(const LatentGrid& seen, const ObservedSpace& space,

@@ -16,6 +16,7 @@ namespace {
 constexpr float kContextNoise = .2f;          // deviation added to visible latents, up to
 constexpr float kContextFalsePositives = .06f;  // wrong tokens among the visible ones, up to
 constexpr float kFrontierShare = .6f;         // of a chunk's targets, at most
+constexpr double kAlone = .75;                // of the samples: condition tokens are all that is visible
 
 double uniform(torch::Generator& random) { return torch::rand({1}, random).item<double>(); }
 double uniform(double low, double high, torch::Generator& random) {
@@ -49,9 +50,11 @@ CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const NodeStates& t
 FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& s,
                       torch::Generator& random) {
   FineMask m;
-  const bool growth = uniform(random) < .5;
-  const int32_t depth = int32_t(torch::randint(6, {1}, random).item<int64_t>());
+  const double kind = uniform(random);
+  const bool alone = kind < kAlone, growth = kind < (1 + kAlone) / 2;
   const std::vector<int32_t> levels = breadthFirstLevels(candidates, s.condition.ijk);
+  const int32_t deepest = levels.empty() ? 1 : *std::max_element(levels.begin(), levels.end());
+  const int32_t depth = int32_t(torch::randint(alone ? deepest : 6, {1}, random).item<int64_t>());
   const Tensor draws = torch::rand({int64_t(candidates.size()), 2}, random);
   const double hidden = uniform(.5, 1, random);
   const double wrong = uniform(0, kContextFalsePositives, random);
@@ -60,9 +63,9 @@ FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSamp
     const float* d = draws.data_ptr<float>() + 2 * i;
     const bool filled = s.target_nodes.at(candidates[i]) == NodeState::kFilled;
     const bool reached = growth ? levels[i] <= depth : d[0] >= hidden;
-    if (reached && filled) {
+    if (!alone && reached && filled) {
       m.visible.push_back(candidates[i]);
-    } else if (reached && d[1] < wrong) {
+    } else if (!alone && reached && d[1] < wrong) {
       m.false_visible.push_back(candidates[i]);
     } else if (growth && levels[i] <= depth) {
       m.others.push_back(candidates[i]);  // visited and rejected: not the frontier any more
@@ -275,7 +278,7 @@ std::map<std::string, double> validate(const std::string& weights, const std::ve
   const Completer completer(weights);
   // Fixed, so that logs compare whatever the program's defaults are.
   CompleteSettings settings;
-  settings.tau = .5f, settings.coarse_tau = .1f;
+  settings.tau = .5f, settings.coarse_tau = .1f, settings.hole_tau = 1;
   Progress silent;
   double precision = 0, recall = 0, f1 = 0, error = 0;
   for (size_t i = 0; i < samples.size(); ++i) {

@@ -23,9 +23,9 @@ CompletionSample readSample(const std::string& path);
 using SampleSource = std::function<CompletionSample(uint64_t index)>;
 
 /// Trains both stages (or resumes). Each step: one sample. Coarse: a random share (.3-1) of the unknown
-/// coarse positions is worked on, a random part of the truth may be visible. Fine: half of the masks are
-/// growth states (BFS depth 0-5 from the condition tokens), half hide a random .5-1 of the truth; context
-/// gets noise and false positives as roll-outs have them. Validation by roll-outs: precision, recall and F1
+/// coarse positions is worked on, a random part of the truth may be visible. Fine: three quarters of the
+/// masks show condition tokens alone and ask about one BFS level, the rest are growth states or hide a
+/// random .5-1 of the truth; visible tokens get noise and false positives as roll-outs have them. Validation by roll-outs: precision, recall and F1
 /// on unobserved level-1 nodes against the dense views' truth.
 void trainCompleter(const CompleterConfig& config, const SampleSource& samples, int64_t sample_count,
                     const SampleSource& validation, int validation_count, const TrainSettings& settings,

@@ -19,11 +19,12 @@ CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const NodeStates& t
 struct FineMask {
   std::vector<Coord> visible;        // filled in truth
   std::vector<Coord> false_visible;  // not filled, yet taken for it: up to 6 %
-  std::vector<Coord> frontier;       // asked next: one step from what is visible
+  std::vector<Coord> frontier;       // asked next: one BFS level, or one step from what is visible
   std::vector<Coord> others;         // hidden, or visited and rejected
 };
-/// Half of the masks are growth states (BFS depth 0-5 from the condition tokens), half hide a random
-/// .5-1 of the truth.
+/// Three quarters show nothing but the condition tokens and ask about one BFS level, any of them, which
+/// is what growth does; an eighth are growth states that see what they made (BFS depth 0-5), an eighth
+/// hide a random .5-1 of the truth.
 FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& sample,
                       torch::Generator& random);
 

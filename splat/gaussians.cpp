@@ -1,5 +1,7 @@
 #include "splat/gaussians.h"
 
+#include <algorithm>
+
 #include "vdb/error.h"
 
 namespace vdbc {
@@ -29,6 +31,20 @@ void requireConsistent(const Gaussians& g) {
           g.opacity_logit.size());
   const size_t values = n * size_t(g.shCoefficients()) * 3;
   require(g.sh.size() == values, "Gaussians: expected ", values, " SH values, found ", g.sh.size());
+}
+
+Gaussians selectGaussians(const Gaussians& from, const std::vector<int64_t>& rows) {
+  Gaussians to;
+  to.resize(int64_t(rows.size()), from.sh_degree);
+  to.antialias = from.antialias;
+  const size_t stride = size_t(from.shCoefficients()) * 3;
+  for (size_t i = 0; i < rows.size(); ++i) {
+    const size_t row = size_t(rows[i]);
+    to.mean[i] = from.mean[row], to.log_scale[i] = from.log_scale[row];
+    to.rotation[i] = from.rotation[row], to.opacity_logit[i] = from.opacity_logit[row];
+    std::copy_n(&from.sh[row * stride], stride, &to.sh[i * stride]);
+  }
+  return to;
 }
 
 void append(Gaussians* gaussians, const Gaussians& more) {

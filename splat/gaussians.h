@@ -26,6 +26,9 @@ struct Gaussians {
 /// Throws Error unless all arrays have matching lengths.
 void requireConsistent(const Gaussians& gaussians);
 
+/// Those Gaussians of `from`, in that order.
+Gaussians selectGaussians(const Gaussians& from, const std::vector<int64_t>& rows);
+
 /// Appends `more` (same SH degree, else Error).
 void append(Gaussians* gaussians, const Gaussians& more);
 

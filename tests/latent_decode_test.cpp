@@ -40,7 +40,7 @@ TEST(LatentDecode, FromTheFileIsFromMemoryByteForByte) {
   const VoxelFrame frame = fitVolume(depth, volume, {});
   const Observation o = observe(views, frame, encoder.observationSettings(), silent);
   LatentGrid latents = encoder.encode(views, o, silent);
-  writeLatentVdb({latents, o.space, encoder.hash()}, folder / "a.latent.vdb");
+  writeLatentVdb({latents, o.space, encoder.hash(), ""}, folder / "a.latent.vdb");
 
   for (float& z : latents.z) z = float(openvdb::math::half(z));
   const DecodedGrid at_once = encoder.decode(latents, o.space, .05f, silent);

@@ -10,10 +10,12 @@
 #include <fstream>
 #include <limits>
 #include <map>
+#include <random>
 #include <set>
 
 #include "encoder/trainer.h"
 #include "encoder/weights.h"
+#include "mar/closing.h"
 #include "mar/completer.h"
 #include "mar/completer_train.h"
 #include "mar/heads.h"
@@ -114,7 +116,7 @@ std::shared_ptr<CompleterNet> makeNet(const CompleterConfig& c, uint64_t seed) {
   torch::NoGradGuard no_grad;
   // Spreads the probabilities, which a fresh network puts all near one half.
   net->occupancy->third->weight.mul_(4), net->coarse_occupancy->third->weight.mul_(4);
-  net->latent_mean.fill_(.25), net->latent_deviation.fill_(1.5);
+  net->latent_mean.fill_(-.42), net->latent_deviation.fill_(.33);
   return net;
 }
 
@@ -556,7 +558,7 @@ std::map<Coord, int> serialLevels(const std::vector<Coord>& candidates,
   return level;
 }
 
-TEST(Masks, FineMasksAreGrowthStatesOrRandomHoles) {  // A2, A3
+TEST(Masks, FineMasksShowNothingOrGrowthStatesOrRandomHoles) {  // A2, A3
   // A corridor of six empty nodes leads to a filled block: no growth state gets that far.
   CompletionSample s;
   const CoordBBox box(Coord(0), Coord(14, 5, 5));
@@ -572,14 +574,14 @@ TEST(Masks, FineMasksAreGrowthStatesOrRandomHoles) {  // A2, A3
   torch::Generator random = at::detail::createCPUGenerator(18);
   std::vector<double> hidden;
   int growth = 0;
-  for (int i = 0; i < 600; ++i) {
+  for (int i = 0; i < 2400; ++i) {
     const FineMask m = drawFineMask(candidates, s, random);
     if (m.visible.empty())
       ++growth;
     else
       hidden.push_back(1 - double(m.visible.size()) / filled);
   }
-  EXPECT_NEAR(growth / 600., .5, .07);
+  EXPECT_NEAR(growth / 2400., .875, .035);
   EXPECT_LT(distanceFromUniform(hidden, .5, 1), .1);
 }
 
@@ -590,9 +592,9 @@ TEST(Masks, FineMasksPartitionTheCandidates) {  // A2, A3
     if (s.seen_nodes.at(*c) == NodeState::kUnobserved) candidates.push_back(*c);
   const std::map<Coord, int> level = serialLevels(candidates, s.condition.ijk);
   torch::Generator random = at::detail::createCPUGenerator(19);
-  std::set<int> depths;
+  std::set<int> depths, asked_alone;
   size_t wrong = 0, total = 0;
-  for (int i = 0; i < 300; ++i) {
+  for (int i = 0; i < 1200; ++i) {
     const FineMask m = drawFineMask(candidates, s, random);
     std::set<Coord> seen;
     size_t n = 0;
@@ -602,6 +604,12 @@ TEST(Masks, FineMasksPartitionTheCandidates) {  // A2, A3
     ASSERT_EQ(seen, std::set<Coord>(candidates.begin(), candidates.end()));
     for (const Coord& c : m.visible) ASSERT_EQ(s.target_nodes.at(c), NodeState::kFilled);
     for (const Coord& c : m.false_visible) ASSERT_NE(s.target_nodes.at(c), NodeState::kFilled);
+    if (m.visible.empty() && m.false_visible.empty()) {  // nothing but the condition tokens: one level is asked
+      const int asked = level.at(m.frontier.at(0));
+      for (const Coord& c : m.frontier) EXPECT_EQ(level.at(c), asked);
+      asked_alone.insert(asked);
+      continue;
+    }
     wrong += m.false_visible.size(), total += candidates.size();
     // The frontier touches what is visible. In a growth state all that is filled up to a level is.
     std::set<Coord> context(s.condition.ijk.begin(), s.condition.ijk.end());
@@ -622,7 +630,8 @@ TEST(Masks, FineMasksPartitionTheCandidates) {  // A2, A3
         }));
     }
   }
-  EXPECT_EQ(depths, (std::set<int>{0, 1, 2, 3, 4, 5}));
+  EXPECT_EQ(depths, (std::set<int>{1, 2, 3, 4, 5}));
+  for (const auto& entry : level) EXPECT_TRUE(asked_alone.count(entry.second)) << entry.second;
   EXPECT_GT(wrong, 0u);
   EXPECT_LT(double(wrong), .06 * double(total));
 }
@@ -761,7 +770,7 @@ TEST_F(CompleterFile, ObservedRowsAreUntouchedAndNoNodeComesTwice) {  // A3, A11
   const Completer completer = completerOf(toyConfig());
   for (const int steps : {0, 4}) {
     CompleteSettings settings;
-    settings.sampling_steps = steps;
+    settings.sampling_steps = steps, settings.hole_tau = 1;
     const LatentGrid whole = complete(completer, settings);
     EXPECT_GT(whole.size(), sample_.condition.size());
     expectObservedRowsFirst(whole);
@@ -823,7 +832,7 @@ TEST_F(CompleterFile, TheFineStageStaysInsideWhatTheCoarseStageKept) {  // A10
 TEST_F(CompleterFile, NothingBeatsAThresholdOfOne) {  // A13
   const Completer completer = completerOf(toyConfig());
   CompleteSettings settings;
-  settings.tau = 1;
+  settings.tau = 1, settings.hole_tau = 1;
   EXPECT_EQ(complete(completer, settings).size(), sample_.condition.size());
 }
 
@@ -848,7 +857,7 @@ TEST_F(CompleterFile, KeptTokensConditionTheNextLevel) {  // A11
   c.chunk_tokens = 4096;
   const Completer completer = completerOf(c);
   CompleteSettings settings;
-  settings.tau = 0;
+  settings.tau = 0, settings.generated_context = true;
   const LatentGrid whole = complete(completer, settings);
   // By hand: level 2 with level 1 in its context, and, to tell it apart, without.
   const SceneTokens t = sceneTokens(sample_.seen_nodes, sample_.seen_coarse);
@@ -890,6 +899,115 @@ TEST_F(CompleterFile, KeptTokensConditionTheNextLevel) {  // A11
   EXPECT_GT(largestDifference(net_->fine(in, sample_.condition.frame).logits.sigmoid(),
                               torch::tensor(truth)),
             1e-4);
+}
+
+TEST_F(CompleterFile, GoesOnFromAnyLevelAsIfItHadNeverStopped) {
+  const Completer completer = completerOf(toyConfig());
+  const ObservedSpace space = spaceOf(sample_.seen_nodes);
+  for (const bool generated_context : {false, true}) {
+    CompleteSettings settings;
+    settings.tau = .5f, settings.hole_tau = .1f, settings.sampling_steps = 3;
+    settings.generated_context = generated_context;
+    std::vector<std::pair<LatentGrid, int32_t>> stops;
+    const LatentGrid whole = completer.complete(
+        sample_.condition, space, settings, silent_,
+        [&](const LatentGrid& so_far, int32_t next_level) { stops.push_back({so_far, next_level}); });
+    ASSERT_GE(stops.size(), 3u);
+    for (const auto& [so_far, next_level] : stops) {
+      SCOPED_TRACE(next_level);
+      settings.first_level = next_level, settings.resumed = true;
+      const LatentGrid rest = completer.complete(so_far, space, settings, silent_);
+      EXPECT_EQ(rest.ijk, whole.ijk);
+      EXPECT_EQ(std::memcmp(rest.z.data(), whole.z.data(), whole.z.size() * sizeof(float)), 0);
+      EXPECT_EQ(rest.probability, whole.probability);
+      EXPECT_EQ(rest.bfs_level, whole.bfs_level);
+      EXPECT_EQ(rest.observed, whole.observed);
+    }
+  }
+}
+
+TEST_F(CompleterFile, LatentsAreWhatFilesHold) {
+  const Completer completer = completerOf(toyConfig());
+  const LatentGrid whole = complete(completer, CompleteSettings());
+  const Tensor z = torch::tensor(std::vector<float>(whole.z.begin() + std::ptrdiff_t(sample_.condition.z.size()), whole.z.end()));
+  ASSERT_GT(z.numel(), 0);
+  EXPECT_TRUE(torch::equal(z, z.to(torch::kHalf).to(torch::kFloat32)));
+}
+
+TEST_F(CompleterFile, NothingIsGeneratedOutsideOfTheRegion) {
+  const Completer completer = completerOf(toyConfig());
+  CompleteSettings settings;
+  settings.tau = 0;
+  const LatentGrid everywhere = complete(completer, settings);
+  auto region = std::make_shared<TokenMask>();
+  region->fill(CoordBBox(Coord(6, 0, 0), Coord(9, 9, 5)), true, true);
+  settings.region = region;
+  const LatentGrid some = complete(completer, settings);
+  expectObservedRowsFirst(some);
+  std::map<Coord, int32_t> expected, found;
+  for (int64_t i = sample_.condition.size(); i < everywhere.size(); ++i)
+    if (region->isValueOn(everywhere.ijk[size_t(i)])) expected[everywhere.ijk[size_t(i)]] = everywhere.bfs_level[size_t(i)];
+  for (int64_t i = sample_.condition.size(); i < some.size(); ++i)
+    found[some.ijk[size_t(i)]] = some.bfs_level[size_t(i)];
+  EXPECT_FALSE(found.empty());
+  EXPECT_EQ(found, expected) << "levels are distances from what was observed, region or not";
+}
+
+TEST_F(CompleterFile, GeneratedTokensOfTheStartStay) {
+  const Completer completer = completerOf(toyConfig());
+  CompleteSettings settings;
+  settings.tau = .4f;
+  const LatentGrid first = complete(completer, settings);
+  const LatentGrid start = keepTokens(first, [&](size_t i) { return first.observed[i] || first.ijk[i].y() < 5; });
+  ASSERT_GT(start.size(), sample_.condition.size());
+  settings.seed = 2, settings.sampling_steps = 2, settings.tau = .9f;  // also those that it would drop
+  const LatentGrid again = completer.complete(start, spaceOf(sample_.seen_nodes), settings, silent_);
+  ASSERT_GE(again.size(), start.size());
+  expectNoDuplicates(again);
+  EXPECT_TRUE(std::equal(start.ijk.begin(), start.ijk.end(), again.ijk.begin()));
+  EXPECT_EQ(std::memcmp(start.z.data(), again.z.data(), start.z.size() * sizeof(float)), 0);
+  LatentGrid mixed = start;
+  std::swap(mixed.observed.front(), mixed.observed.back());
+  EXPECT_THROW(completer.complete(mixed, spaceOf(sample_.seen_nodes), settings, silent_), Error);
+}
+
+TEST_F(CompleterFile, WithoutGeneratedContextAHigherTauOnlyDrops) {
+  const Completer completer = completerOf(toyConfig());
+  CompleteSettings settings;
+  settings.tau = .3f, settings.hole_tau = 1;
+  const LatentGrid low = complete(completer, settings);
+  settings.tau = .55f;
+  const LatentGrid high = complete(completer, settings);
+  const LatentGrid dropped = keepTokens(low, [&](size_t i) { return low.probability[i] > .55f; });
+  EXPECT_LT(high.size(), low.size());
+  EXPECT_GT(high.size(), sample_.condition.size());
+  EXPECT_EQ(high.ijk, dropped.ijk);
+  EXPECT_EQ(high.z, dropped.z);
+}
+
+TEST_F(CompleterFile, PlacesBeyondOneWindowAreVisitedOnceEverywhere) {
+  // A floor of 30 m, seen at one end and in the middle; dense states of the rest are unknown.
+  const Completer completer = completerOf(toyConfig());
+  LatentGrid seen;
+  seen.dim = kDim;
+  seen.frame.bounds = CoordBBox(Coord(0), Coord(303, 15, 7));
+  ObservedSpace space;
+  for (int x0 : {0, 70})
+    for (auto c = CoordBBox(Coord(x0, 0, 1), Coord(x0 + 3, 3, 1)).begin(); c; ++c) {
+      seen.ijk.push_back(*c);
+      for (int d = 0; d < kDim; ++d) seen.z.push_back(std::sin(float(d)));
+      for (int slot = 0; slot < 8; ++slot) space.filled.setValueOn(childCoord(*c, slot));
+    }
+  seen.observed.assign(seen.ijk.size(), 1), seen.probability.assign(seen.ijk.size(), 1.f);
+  seen.bfs_level.assign(seen.ijk.size(), 0);
+  CompleteSettings settings;
+  settings.tau = 0, settings.coarse_tau = 0;
+  const LatentGrid whole = completer.complete(seen, space, settings, silent_);
+  expectNoDuplicates(whole);
+  // Four windows of 38 nodes; the last one is too far from anything seen.
+  EXPECT_EQ(whole.size(), 3 * 38 * 8 * 4);
+  for (const Coord& c : whole.ijk) EXPECT_LT(c.x(), 3 * 38);
+  for (const float z : whole.z) ASSERT_TRUE(std::isfinite(z));
 }
 
 TEST_F(CompleterFile, OracleMakesExactlyTheGivenTokens) {  // the oracle of the evaluation
@@ -953,6 +1071,119 @@ TEST_F(CompleterFile, NothingUnseenLeavesTheGridAsItIs) {
   const LatentGrid whole = completer.complete(sample_.condition, spaceOf(all), {}, silent_);
   EXPECT_EQ(whole.ijk, sample_.condition.ijk);
   EXPECT_EQ(whole.z, sample_.condition.z);
+}
+
+// --- closing holes -------------------------------------------------------------------------------
+
+/// Whether the border can be reached from the seen empty nodes through faces.
+bool isOpen(const NodeStates& nodes, const std::set<Coord>& solid) {
+  std::set<Coord> reached;
+  std::deque<Coord> queue;
+  for (auto c = nodes.box.begin(); c; ++c)
+    if (nodes.at(*c) == NodeState::kEmpty) reached.insert(*c), queue.push_back(*c);
+  while (!queue.empty()) {
+    const Coord at = queue.front();
+    queue.pop_front();
+    for (int axis = 0; axis < 3; ++axis)
+      for (int side : {-1, 1}) {
+        Coord n = at;
+        n[axis] += side;
+        if (!nodes.box.isInside(n)) return true;
+        if (!solid.count(n) && reached.insert(n).second) queue.push_back(n);
+      }
+  }
+  return false;
+}
+
+TEST(ClosingTokens, AreTheCheapestOfAllThatClose) {  // against every subset
+  // One seen empty node in a 5^3 block; the 26 nodes around it are walls but for some holes.
+  const CoordBBox box(Coord(0), Coord(4));
+  std::mt19937 random(3);
+  std::uniform_real_distribution<float> chance(.05f, .95f);
+  int closed = 0;
+  for (int trial = 0; trial < 40; ++trial) {
+    NodeStates nodes = makeStates(1, box);
+    nodes.states[size_t(nodes.index(Coord(2)))] = NodeState::kEmpty;
+    std::vector<Coord> walls;
+    std::map<Coord, float> dropped;
+    for (auto c = CoordBBox(Coord(1), Coord(3)).begin(); c; ++c) {
+      if (*c == Coord(2)) continue;
+      if (random() % 3 == 0 && dropped.size() < 11)
+        dropped[*c] = chance(random);
+      else
+        walls.push_back(*c);
+    }
+    // Another way to close the same holes, one node further out.
+    if (!dropped.empty() && dropped.size() < 12) {
+      Coord outer = dropped.begin()->first;
+      for (int axis = 0; axis < 3; ++axis)
+        if (outer[axis] != 2) {
+          outer[axis] += outer[axis] - 2;
+          break;
+        }
+      dropped[outer] = chance(random);
+    }
+    double best = 1e30;
+    std::set<Coord> cheapest;
+    const std::vector<std::pair<Coord, float>> list(dropped.begin(), dropped.end());
+    for (size_t subset = 0; subset < size_t(1) << list.size(); ++subset) {
+      std::set<Coord> solid(walls.begin(), walls.end()), chosen;
+      double cost = 0;
+      for (size_t i = 0; i < list.size(); ++i)
+        if (subset >> i & 1) chosen.insert(list[i].first), cost -= std::log(double(list[i].second));
+      if (cost >= best) continue;
+      solid.insert(chosen.begin(), chosen.end());
+      if (!isOpen(nodes, solid)) best = cost, cheapest = chosen;
+    }
+    const std::vector<Coord> found = closingTokens(nodes, walls, dropped, 0);
+    EXPECT_EQ(std::set<Coord>(found.begin(), found.end()), cheapest) << trial;
+    closed += !cheapest.empty();
+    float likeliest = 0;
+    for (const Coord& c : found) likeliest = std::max(likeliest, dropped.at(c));
+    EXPECT_TRUE(closingTokens(nodes, walls, dropped, likeliest).empty());
+  }
+  EXPECT_GT(closed, 20);
+}
+
+TEST(ClosingTokens, WhatCannotBeClosedIsClosedAsFarAsItCan) {
+  // A tunnel of seen empty nodes with two mouths: one has a dropped token in it, one has none.
+  NodeStates nodes = makeStates(1, CoordBBox(Coord(0), Coord(8, 2, 2)));
+  std::vector<Coord> walls;
+  for (auto c = nodes.box.begin(); c; ++c) {
+    const bool inside = (*c).y() == 1 && (*c).z() == 1;
+    if (!inside)
+      walls.push_back(*c);
+    else if ((*c).x() >= 2 && (*c).x() <= 6)
+      nodes.states[size_t(nodes.index(*c))] = NodeState::kEmpty;
+  }
+  const Coord mouth(1, 1, 1);
+  EXPECT_EQ(closingTokens(nodes, walls, {{mouth, .2f}}, .1f), std::vector<Coord>{mouth});
+  EXPECT_TRUE(closingTokens(nodes, walls, {{mouth, .2f}}, .3f).empty());
+  EXPECT_TRUE(closingTokens(nodes, walls, {}, 0).empty());
+}
+
+TEST_F(CompleterFile, HolesAreClosedWithDroppedTokensAlone) {
+  const Completer completer = completerOf(toyConfig());
+  CompleteSettings settings;
+  settings.tau = .5f, settings.hole_tau = 1;
+  const LatentGrid open = complete(completer, settings);
+  settings.tau = 0;
+  const LatentGrid everything = complete(completer, settings);
+  settings.tau = .5f, settings.hole_tau = .01f;
+  const LatentGrid closed = complete(completer, settings);
+  expectNoDuplicates(closed);
+  ASSERT_GT(closed.size(), open.size());
+  EXPECT_TRUE(std::equal(open.ijk.begin(), open.ijk.end(), closed.ijk.begin()));
+  EXPECT_TRUE(std::equal(open.z.begin(), open.z.end(), closed.z.begin()));
+  std::map<Coord, size_t> row;
+  for (size_t i = 0; i < everything.ijk.size(); ++i) row[everything.ijk[i]] = i;
+  for (size_t i = size_t(open.size()); i < size_t(closed.size()); ++i) {
+    const size_t same = row.at(closed.ijk[i]);
+    EXPECT_LE(closed.probability[i], .5f);
+    EXPECT_EQ(closed.probability[i], everything.probability[same]);
+    EXPECT_EQ(closed.bfs_level[i], everything.bfs_level[same]);
+    EXPECT_TRUE(std::equal(&closed.z[i * kDim], &closed.z[i * kDim] + kDim, &everything.z[same * kDim]));
+  }
 }
 
 TEST_F(CompleterFile, LoadsWhatWasSavedAndRejectsTheRest) {

@@ -1,4 +1,4 @@
-// The baselines of the reconstruction, and what counts there.
+// The baselines of the evaluations, and what counts there.
 #include "houdini_style_tools/reconstruct.h"
 
 #include <gtest/gtest.h>
@@ -133,6 +133,75 @@ TEST(Reconstruct, SetScoresCount) {
   EXPECT_DOUBLE_EQ(s.precision, 2 / 3.);
   EXPECT_DOUBLE_EQ(s.recall, .5);
   EXPECT_DOUBLE_EQ(s.f1, 4 / 7.);
+  EXPECT_DOUBLE_EQ(s.iou, 2 / 5.);
+  EXPECT_DOUBLE_EQ(s.iou, s.f1 / (2 - s.f1));
+  EXPECT_TRUE(std::isnan(setScores({}, {}).iou));
+}
+
+TEST(Evaluate, OutsideIsWhatLiesBehindTheShell) {
+  // A room of 2 x 1.6 x 1.2 m, turned; its walls in the middle of nodes: 11 x 9 x 7 nodes are in it or in its shell.
+  Room room;
+  room.world_from_room = Eigen::Translation3f(1, -2, .3f) * Eigen::AngleAxisf(.7f, Eigen::Vector3f::UnitZ());
+  SurfaceMesh local;
+  const Eigen::Vector3f size(2, 1.6f, 1.2f);
+  addBox(Eigen::Vector3f::Zero(), size, Material(), true, &local);
+  room.surface.append(local, Eigen::Affine3f(room.world_from_room));
+  room.floor = {{0, 0}, {size.x(), 0}, {size.x(), size.y()}, {0, size.y()}};
+  room.ceilings = {{0, 0, size.z()}};
+  EvaluationScene scene;
+  scene.is_within = [&](const Eigen::Vector3f& p) { return isWithin(room, room.world_from_room.inverse() * p); };
+  VoxelFrame frame;
+  frame.world_from_grid = room.world_from_room.cast<double>();
+  frame.world_from_grid.linear() = Eigen::Quaterniond(frame.world_from_grid.linear()).normalized().toRotationMatrix();
+  frame.world_from_grid.translate(Eigen::Vector3d::Constant(-.1));
+  const std::vector<Coord> surface = surfaceNodes(solidMesh(room.surface), frame, 1);
+  const std::set<Coord> truth(surface.begin(), surface.end());
+  EXPECT_EQ(truth.size(), 11u * 9 * 7 - 9 * 7 * 5);
+  std::set<Coord> filled;
+  for (int x = -1; x <= 11; ++x)
+    for (int y = -1; y <= 9; ++y)
+      for (int z = -1; z <= 7; ++z) filled.insert(Coord(x, y, z));
+  EXPECT_EQ(outsideCount(scene, frame, filled, truth), 13 * 11 * 9 - 11 * 9 * 7);
+  EXPECT_EQ(outsideCount(scene, frame, truth, truth), 0);
+}
+
+TEST(Evaluate, ReliabilityCountsGeneratedNodes) {
+  LatentGrid latents;
+  const auto add = [&](int x, float probability, bool observed) {
+    latents.ijk.emplace_back(x, 0, 0);
+    latents.probability.push_back(probability), latents.observed.push_back(observed);
+  };
+  add(0, 1, true), add(1, .25f, false), add(2, .25f, false), add(3, .75f, false), add(4, 1, false), add(5, 0, false);
+  const Reliability r = reliabilityOf(latents, {{0, 0, 0}, {1, 0, 0}, {4, 0, 0}});
+  const std::array<int, 10> counts = {1, 0, 2, 0, 0, 0, 0, 1, 0, 1}, hits = {0, 0, 1, 0, 0, 0, 0, 0, 0, 1};
+  for (size_t i = 0; i < r.size(); ++i) {
+    EXPECT_EQ(r[i].count, counts[i]);
+    EXPECT_EQ(r[i].hits, hits[i]);
+  }
+  EXPECT_DOUBLE_EQ(r[2].sum_probability, .5);
+  EXPECT_DOUBLE_EQ(calibrationError(r), (2 * .25 + .75) / 5);  // bin 2: half are hits, not a quarter
+  EXPECT_TRUE(std::isnan(calibrationError({})));
+}
+
+TEST(Evaluate, MeansSumTheReliabilityAndDeviationsAreOfTheSample) {
+  std::vector<MethodResult> results(4);
+  for (size_t i = 0; i < results.size(); ++i) results[i].method = i < 3 ? "a" : "b";
+  results[0].psnr = 20, results[1].psnr = 23, results[2].psnr = 26;
+  results[0].leak = .2, results[1].leak = .4, results[2].leak = std::numeric_limits<double>::quiet_NaN();
+  results[0].reliability.emplace(), results[1].reliability.emplace();
+  (*results[0].reliability)[3] = {2, 1, .7}, (*results[1].reliability)[3] = {4, 1, 1.3};
+  const std::vector<MethodResult> means = meanResults(results), deviations = deviationResults(results);
+  ASSERT_EQ(means.size(), 2u);
+  ASSERT_TRUE(means[0].reliability);
+  EXPECT_EQ((*means[0].reliability)[3].count, 6);
+  EXPECT_EQ((*means[0].reliability)[3].hits, 2);
+  EXPECT_DOUBLE_EQ((*means[0].reliability)[3].sum_probability, 2);
+  EXPECT_FALSE(means[1].reliability);
+  ASSERT_EQ(deviations.size(), 2u);
+  EXPECT_EQ(deviations[0].scene, "std");
+  EXPECT_DOUBLE_EQ(deviations[0].psnr, 3);
+  EXPECT_NEAR(deviations[0].leak, .2 / std::sqrt(2.), 1e-12);
+  EXPECT_TRUE(std::isnan(deviations[1].psnr));
 }
 
 TEST(Reconstruct, MeansLeaveOutWhatIsNotThere) {

@@ -32,6 +32,7 @@ constexpr const char* kRow = "row";
 constexpr const char* kLevel = "latent_level";
 constexpr const char* kDim = "latent_dim";
 constexpr const char* kHash = "encoder_hash";
+constexpr const char* kGrowth = "growth";
 constexpr const char* kFrame = "world_from_grid";
 
 /// Throws unless every token makes sense; for writer and reader.
@@ -121,6 +122,7 @@ openvdb::MetaMap metadataOf(const LatentFile& file) {
   openvdb::MetaMap metadata;
   metadata.insertMeta("creator", openvdb::StringMetadata("vdb_complete"));
   metadata.insertMeta(kHash, openvdb::StringMetadata(file.encoder_hash));
+  if (!file.growth.empty()) metadata.insertMeta(kGrowth, openvdb::StringMetadata(file.growth));
   metadata.insertMeta(kLevel, openvdb::Int32Metadata(g.level));
   metadata.insertMeta(kDim, openvdb::Int32Metadata(g.dim));
   insertVolume(g.frame, &metadata);
@@ -251,6 +253,7 @@ LatentFile readLatentVdb(const std::string& path) {
     g.frame =
         exactFrame(metadata, readVolume(kRead, metadata, grid->transform(), level, path), path);
   file.encoder_hash = findMetadata<std::string>(kRead, metadata, kHash, path);
+  if (metadata[kGrowth]) file.growth = findMetadata<std::string>(kRead, metadata, kGrowth, path);
   try {
     readTokens(*tokens, &g, path);
   } catch (const openvdb::Exception& error) {  // an attribute of another type

@@ -11,11 +11,12 @@ struct LatentFile {
   LatentGrid latents;
   ObservedSpace seen;
   std::string encoder_hash;  // Encoder::hash()
+  std::string growth;        // where a completion that was cut short goes on; else empty
 };
 
 /// Writes a points grid `latent` with one point at each node's centre: P, z (half, stride dim),
 /// probability, bfs_level, generated, row; bool grids `filled` and `empty` of the voxels seen;
-/// metadata: latent_level, latent_dim, encoder_hash, the frame (exactly), the volume, counts. All
+/// metadata: latent_level, latent_dim, encoder_hash, growth, the frame (exactly), the volume, counts. All
 /// but z, which is rounded to half precision, reads back bit for bit, rows in their order. A
 /// checksum follows. Temporary name, then rename. docs/formats.md. Spec E10.
 /// Throws Error for arrays of different lengths, tokens outside the volume or twice the same,

@@ -1,0 +1,76 @@
+#include "houdini_style_tools/checkpoint.h"
+
+#include <nlohmann/json.hpp>
+
+#include "vdb/file_io.h"
+#include "vdb/latent_vdb.h"
+
+namespace vdbc {
+
+using nlohmann::json;
+
+namespace {
+constexpr const char* kNextLevel = "next_level";
+
+// Hexadecimal.
+std::string hashOf(const std::string& bytes) {
+  const std::string sum = checksumTrailer(bytes.data(), bytes.size());
+  std::string text;
+  for (size_t i = sum.size() - sizeof(uint64_t); i < sum.size(); ++i)
+    for (int digit : {uint8_t(sum[i]) >> 4, uint8_t(sum[i]) & 15}) text += "0123456789abcdef"[digit];
+  return text;
+}
+
+template <typename T>
+void appendBytes(const std::vector<T>& values, std::string* bytes) {
+  bytes->append(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T));
+}
+
+std::string hashOf(const LatentGrid& g) {
+  std::string bytes;
+  for (const Coord& c : {g.frame.bounds.min(), g.frame.bounds.max()})
+    bytes.append(reinterpret_cast<const char*>(c.data()), 3 * sizeof(int32_t));
+  for (const Coord& c : g.ijk) bytes.append(reinterpret_cast<const char*>(c.data()), 3 * sizeof(int32_t));
+  appendBytes(g.z, &bytes), appendBytes(g.observed, &bytes);
+  appendBytes(g.probability, &bytes), appendBytes(g.bfs_level, &bytes);
+  return hashOf(bytes);
+}
+
+std::string hashOf(const TokenMask& mask) {
+  std::string bytes;
+  for (const Coord& c : activeCoords(mask)) bytes.append(reinterpret_cast<const char*>(c.data()), 3 * sizeof(int32_t));
+  return hashOf(bytes);
+}
+}  // namespace
+
+std::string completionIdentity(const Completer& completer, const LatentGrid& start, const CompleteSettings& s) {
+  return json{{"completer", completer.hash()}, {"start", hashOf(start)}, {"first_level", s.first_level}, {"tau", s.tau},
+              {"coarse_tau", s.coarse_tau}, {"hole_tau", s.hole_tau}, {"neighbours", int(s.neighbours)},
+              {"sampling_steps", s.sampling_steps}, {"temperature", s.temperature},
+              {"generated_context", s.generated_context}, {"refine_observed", s.refine_observed}, {"seed", s.seed},
+              {"region", s.region ? hashOf(*s.region) : ""}}
+      .dump();
+}
+
+void writeCheckpoint(const LatentGrid& so_far, int32_t next_level, const ObservedSpace& space,
+                     const std::string& encoder_hash, const std::string& identity, const std::string& path) {
+  json growth = json::parse(identity);
+  growth[kNextLevel] = next_level;
+  writeLatentVdb({so_far, space, encoder_hash, growth.dump()}, path);
+}
+
+void readCheckpoint(const std::string& path, const std::string& encoder_hash, const std::string& identity,
+                    LatentGrid* start, CompleteSettings* settings) {
+  const LatentFile file = readLatentVdb(path);
+  json growth = json::parse(file.growth, nullptr, false);
+  require(growth.is_object() && growth.contains(kNextLevel) && growth[kNextLevel].is_number_integer(), "--resume: ", path,
+          ": expected a completion that was cut short, found another latent file");
+  const int32_t next_level = growth[kNextLevel];
+  growth.erase(kNextLevel);
+  require(growth.dump() == identity && file.encoder_hash == encoder_hash, "--resume: ", path,
+          ": is of another place, settings or weights (expected ", identity, ", found ", growth.dump(), ")");
+  *start = file.latents;
+  settings->first_level = next_level, settings->resumed = true;
+}
+
+}  // namespace vdbc
