@@ -39,21 +39,21 @@ run unguided 2 guide_alpha=1
 run base 2
 run m1 1 gaussians_per_voxel=1
 run fp0 1 false_positives=0
+run dim16 1 latent_dim=16
+run voxel20cm 1 voxel_m=0.2
+run blocks1 1 blocks=1 decoder_blocks=1
+run width48 1 width=48 voxel_width=24
 run levels0 1 levels=0
 run levels2 1 levels=2
-run width48 1 width=48 voxel_width=24
-run width192 1 width=192 voxel_width=96 heads=6
-run blocks1 1 blocks=1 decoder_blocks=1
-run blocks4 1 blocks=4 decoder_blocks=4
-run voxel20cm 1 voxel_m=0.2
-run m64 1 gaussians_per_voxel=64
-run fp100 1 false_positives=1.0
-run dim16 1 latent_dim=16
 run dim128 1 latent_dim=128
+run blocks4 1 blocks=4 decoder_blocks=4
 run beta1e-3 1 kl_weight=1e-3
-run beta1e-1 1 kl_weight=1e-1
+run fp100 1 false_positives=1.0
 run levels2-fp0 1 levels=2 false_positives=0
 run levels2-fp100 1 levels=2 false_positives=1.0
+run width192 1 width=192 voxel_width=96 heads=6
+run m64 1 gaussians_per_voxel=64
+run beta1e-1 1 kl_weight=1e-1
 run voxel5cm 1 voxel_m=0.05
 run guided-log 1 guide_log_counts=true
 

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Makes every figure that README and docs quote: evaluation on held-out rooms and on a real capture, and the
-# README's picture. Results in docs/results/. Takes about half an hour on two cores.
+# Makes the figures that README and docs quote of the encoder-decoder and of real captures, and the README's picture; those
+# of the completer are study.sh's. Results in docs/results/. Takes about half an hour.
 #   sh examples/figures.sh [FOLDER with rgbd_redkitchen, default ../shared/data]
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
@@ -10,10 +10,8 @@ results=$root/docs/results
 mkdir -p "$results" "$root/out"
 : >"$root/out/figures.log"
 
-"$program" eval --scenes rooms:1-24 --views 2 --json 2>>"$root/out/figures.log" >"$results/rooms_2_views.jsonl"
-"$program" eval --scenes homes:0-7 --views 2 --json 2>>"$root/out/figures.log" >"$results/homes_2_views.jsonl"
 "$program" eval --reconstruct --scenes rooms:1-8 --json 2>>"$root/out/figures.log" >"$results/rooms_reconstruct.jsonl"
-"$program" eval --reconstruct --scenes homes:0-6 --json 2>>"$root/out/figures.log" >"$results/homes_reconstruct.jsonl"
+"$program" eval --reconstruct --scenes homes:0-8 --json 2>>"$root/out/figures.log" >"$results/homes_reconstruct.jsonl"
 "$program" "$root/examples/two_views" -o "$root/out/two_views.vdb" --json 2>>"$root/out/figures.log" >"$results/two_views.json"
 cp "$root/out/two_views.png" "$root/docs/two_views.png"
 if [ -d "$data/rgbd_redkitchen" ]; then

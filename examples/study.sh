@@ -1,0 +1,131 @@
+#!/bin/sh
+# The completer's study: every method on held-out rooms with 1 to 12 views in, and on example homes; charts against the
+# number of views (bars: standard error over the same rooms), the reliability of the stored probabilities, and tables of
+# two views. Can be stopped and started again: finished parts stay; delete their .jsonl after the weights have changed.
+# One thread, well over an hour. The charts need gnuplot.
+#   sh examples/study.sh [FOLDER, default docs: writes completion.svg, results/completion.md, results/completion-*.jsonl]
+# ROOMS (1-8), MORE_ROOMS (9-64, at two views) and HOMES (0-7) choose other scenes, VIEWS other numbers of views for the
+# curves.
+set -eu
+root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
+folder=${1:-$root/docs}
+program=${VDB_COMPLETE:-$root/build/release/vdb_complete}
+views="${VIEWS:-1 2 4 8 12}"
+data=$root/out/study
+mkdir -p "$folder/results" "$data"
+results=$(CDPATH='' cd -- "$folder/results" && pwd -P)
+
+# fileOf SCENES VIEWS: where their lines are.
+fileOf() { echo "$results/completion-$(echo "$1" | tr : _)-$2.jsonl"; }
+
+# part SCENES VIEWS
+part() {
+  if [ -s "$(fileOf "$1" "$2")" ]; then return; fi
+  echo "$1, $2 views" >&2
+  "$program" eval --scenes "$1" --views "$2" --threads 1 --json 2>>"$data/eval.log" >"$data/part.jsonl"
+  mv "$data/part.jsonl" "$(fileOf "$1" "$2")"
+}
+
+# statistics FILE...: a line "method score scenes mean deviation" for each number of the scenes' results.
+statistics() {
+  cat "$@" | grep -v -e '"scene":"mean"' -e '"scene":"std"' -e '"reliability"' | awk '
+    { match($0, "\"method\":\"[^\"]*"); method = substr($0, RSTART + 10, RLENGTH - 10)
+      rest = $0
+      while (match(rest, "\"[a-z0-9_]+\":-?[0-9][-+0-9.e]*")) {
+        split(substr(rest, RSTART + 1, RLENGTH - 1), pair, "\":")
+        rest = substr(rest, RSTART + RLENGTH)
+        at = method " " pair[1]
+        count[at]++; sum[at] += pair[2]; square[at] += pair[2] * pair[2]
+      } }
+    END { for (at in count) {
+      n = count[at]; mean = sum[at] / n; variance = n > 1 ? (square[at] - n * mean * mean) / (n - 1) : 0
+      print at, n, mean, sqrt(variance > 0 ? variance : 0) } }'
+}
+
+# table FILE...: Markdown, mean +- standard deviation.
+table() {
+  statistics "$@" | awk '
+    { mean[$1, $2] = $4; deviation[$1, $2] = $5 }
+    END {
+      methods = split("observed pixel-aligned nearest box completed oracle-occupancy", method, " ")
+      scores = split("psnr ssim flip precision recall shell_recall furniture_recall f1 iou outside leak ece seconds", score, " ")
+      head = "| method | PSNR | SSIM | FLIP | precision | recall | of the shell | of furniture | F1 | IoU | outside | leak | ECE | s |"
+      print head; gsub("[^|]+", "---", head); print head
+      for (m = 1; m <= methods; ++m) {
+        row = "| " method[m]
+        for (s = 1; s <= scores; ++s) {
+          at = method[m] SUBSEP score[s]
+          digits = score[s] == "psnr" || score[s] == "seconds" ? 2 : score[s] == "outside" ? 0 : 3
+          row = row " | " (at in mean ? sprintf("%.*f +- %.*f", digits, mean[at], digits, deviation[at]) : "")
+        }
+        print row " |"
+      } }'
+}
+
+# scenes FILE...: how many.
+scenes() { cat "$@" | grep '"method":"completed"' | grep -v -e '"scene":"mean"' -e '"scene":"std"' -e '"reliability"' -c; }
+
+# reliability FILE...: a line "mean-probability share-in-truth nodes" a bin, over all scenes.
+reliability() {
+  cat "$@" | grep '"reliability"' | grep -v '"scene":"mean"' | sed 's/.*"reliability":\[\[//; s/\]\].*//; s/\],\[/ /g' | awk '
+    { for (i = 1; i <= NF; ++i) { split($i, bin, ","); count[i] += bin[1]; sum[i] += bin[2]; hits[i] += bin[3] } }
+    END { for (i = 1; i <= 10; ++i) if (count[i] > 0) print sum[i] / count[i], hits[i] / count[i], count[i] }'
+}
+
+some=rooms:${ROOMS:-1-8} more=rooms:${MORE_ROOMS:-9-64} all_homes=homes:${HOMES:-0-7}
+part "$some" 2
+part "$more" 2
+part "$all_homes" 2
+for n in $views; do part "$some" "$n"; done
+
+rooms="$(fileOf "$some" 2) $(fileOf "$more" 2)"
+homes=$(fileOf "$all_homes" 2)
+# shellcheck disable=SC2086  # two files
+{
+  printf 'Two views in, mean +- standard deviation over scenes (sh examples/study.sh).\n\n'
+  printf '%s rooms:\n\n' "$(scenes $rooms)"
+  table $rooms
+  printf '\n%s rooms of example homes:\n\n' "$(scenes "$homes")"
+  table "$homes"
+} >"$data/completion.md"
+mv "$data/completion.md" "$results/completion.md"
+
+rm -f "$data"/curve-*
+for n in $views; do
+  statistics "$(fileOf "$some" "$n")" | while read -r method score count mean deviation; do
+    echo "$n $count $mean $deviation" | awk '{ print $1, $3, $4 / sqrt($2) }' >>"$data/curve-$method-$score"
+  done
+done
+# shellcheck disable=SC2086
+reliability $rooms >"$data/curve-rooms"
+reliability "$homes" >"$data/curve-homes"
+cd "$data"
+gnuplot <<'PLOT'
+set terminal svg size 1350,800 font "sans,13" background "white"
+set output "completion.svg"
+set multiplot layout 2,3 margins .05,.98,.08,.88 spacing .06,.15
+set grid
+set linetype 5 lc rgb "#d62728"
+methods = "observed pixel-aligned nearest box completed oracle-occupancy"
+scores = "psnr ssim flip f1 leak"
+titles = "'PSNR [dB]' 'SSIM' 'FLIP (low is good)' 'Strict F1 of unseen nodes' 'Leak (low is good)'"
+set xlabel "views in"
+set offsets .5, .5, 0, 0
+unset key
+do for [m = 1:words(methods)] { set label word(methods, m) at screen .15 * m - .06, screen .97 textcolor lt m font ",14" }
+do for [s = 1:words(scores)] {
+  set title word(titles, s)
+  plot for [m = 1:words(methods)] "curve-".word(methods, m)."-".word(scores, s) using 1:2:3 \
+    with yerrorlines lw 1.5 pt 7 ps .5 lc m
+  unset label
+}
+set title "Reliability of generated nodes, two views"
+set xlabel "stored probability"; set ylabel "share that is there"
+set offsets 0, 0, 0, 0
+set xrange [0:1]; set yrange [0:1]
+set key top left font ",10"
+plot x with lines lc "gray" dt 2 title "calibrated", "curve-rooms" with linespoints lw 1.5 pt 7 ps .5 lc 5 title "rooms", \
+  "curve-homes" with linespoints lw 1.5 pt 7 ps .5 lc 3 title "homes"
+PLOT
+mv completion.svg "$results/../completion.svg"
+cat "$results/completion.md"
