@@ -230,8 +230,9 @@ std::shared_ptr<const TokenMask> allowedTokens(const Complete& o, const VoxelFra
   return allowed;
 }
 
-// The n-th of several completions: X.vdb, X.2.vdb, X.3.vdb.
 constexpr const char* kOccupancyEnding = ".occupancy.vdb";
+
+// The n-th of several completions: X.vdb, X.2.vdb, X.3.vdb.
 std::string sampleStem(const std::string& stem, int n) { return n == 1 ? stem : joinText(stem, ".", n); }
 
 std::string checkpointOf(const std::string& stem) { return stem + ".checkpoint" + kLatentEnding; }
@@ -256,9 +257,8 @@ Completion cookSample(const SceneInput& in, LatentGrid start, const ObservedSpac
   return c;
 }
 
-void cookComplete(const Complete& o, const Common& common, Progress& progress) {
-  const bool from_latents = endsWith(o.views, kLatentEnding);
-  const ReadViewsSettings chosen = reading(o.frames, o.scale);
+// The output's stem, once all names can be written and what is to be resumed is there.
+std::string completionStem(const Complete& o, bool from_latents) {
   const std::vector<std::string> more = from_latents ? std::vector<std::string>{kLatentEnding}
                                                      : std::vector<std::string>{kLatentEnding, kPictureEnding};
   const std::string stem = outputStem(o.output, more);
@@ -268,28 +268,31 @@ void cookComplete(const Complete& o, const Common& common, Progress& progress) {
   bool begun = !o.resume;
   for (int n = 1; n <= o.samples; ++n) begun = begun || fs::exists(checkpointOf(sampleStem(stem, n)));
   require(begun, "--resume: ", checkpointOf(stem), ": no such file (expected a run that was cut short)");
+  return stem;
+}
+
+void cookComplete(const Complete& o, const Common& common, Progress& progress) {
+  const bool from_latents = endsWith(o.views, kLatentEnding);
+  const ReadViewsSettings chosen = reading(o.frames, o.scale);
+  const std::string stem = completionStem(o, from_latents);
   const std::string weights = weightsFolder(o.weights);
   const auto begin = std::chrono::steady_clock::now();
   progress.start("read");
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
   SceneInput in;
-  LatentFile encoded;
-  if (from_latents) {
-    LatentFile file = readLatents(o.views, encoder, weights);
-    in.up = file.latents.frame.world_from_grid.linear().col(2);
-    in.settings = sceneSettings(o, common, in.up);
-    encoded.latents = std::move(file.latents);
-    encoded.seen.filled.root() = file.seen.filled.root(), encoded.seen.empty.root() = file.seen.empty.root();
-    progress.end();
-  } else {
+  const LatentFile encoded = [&]() -> LatentFile {
+    if (from_latents) {
+      LatentFile file = readLatents(o.views, encoder, weights);
+      in = {{}, file.latents.frame.world_from_grid.linear().col(2), sceneSettings(o, common, Eigen::Vector3d::UnitZ())};
+      progress.end();
+      return file;
+    }
     in = readScene(o, common, chosen);
     progress.end();
     const Encoding e = naming(o.views, [&] { return encodeScene(in.views, encoder, in.settings, progress); });
-    encoded.latents = e.latents;
-    encoded.seen.filled.root() = e.observation.space.filled.root();
-    encoded.seen.empty.root() = e.observation.space.empty.root();
-  }
+    return {e.latents, e.observation.space, encoder.hash(), ""};
+  }();
   const LatentGrid& all = encoded.latents;
   require(o.from_level == 1 || std::count(all.bfs_level.begin(), all.bfs_level.end(), o.from_level - 1) > 0,
           "--from-level: ", o.views, ": expected tokens of growth level ", o.from_level - 1, ", found none");
