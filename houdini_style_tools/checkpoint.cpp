@@ -1,6 +1,7 @@
 #include "houdini_style_tools/checkpoint.h"
 
 #include <nlohmann/json.hpp>
+#include <type_traits>
 
 #include "vdb/file_io.h"
 #include "vdb/latent_vdb.h"
@@ -23,22 +24,21 @@ std::string hashOf(const std::string& bytes) {
 
 template <typename T>
 void appendBytes(const std::vector<T>& values, std::string* bytes) {
+  static_assert(std::is_standard_layout_v<T>, "expected plain numbers");
   bytes->append(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T));
 }
 
 std::string hashOf(const LatentGrid& g) {
   std::string bytes;
-  for (const Coord& c : {g.frame.bounds.min(), g.frame.bounds.max()})
-    bytes.append(reinterpret_cast<const char*>(c.data()), 3 * sizeof(int32_t));
-  for (const Coord& c : g.ijk) bytes.append(reinterpret_cast<const char*>(c.data()), 3 * sizeof(int32_t));
-  appendBytes(g.z, &bytes), appendBytes(g.observed, &bytes);
+  appendBytes(std::vector<Coord>{g.frame.bounds.min(), g.frame.bounds.max()}, &bytes);
+  appendBytes(g.ijk, &bytes), appendBytes(g.z, &bytes), appendBytes(g.observed, &bytes);
   appendBytes(g.probability, &bytes), appendBytes(g.bfs_level, &bytes);
   return hashOf(bytes);
 }
 
 std::string hashOf(const TokenMask& mask) {
   std::string bytes;
-  for (const Coord& c : activeCoords(mask)) bytes.append(reinterpret_cast<const char*>(c.data()), 3 * sizeof(int32_t));
+  appendBytes(activeCoords(mask), &bytes);
   return hashOf(bytes);
 }
 }  // namespace

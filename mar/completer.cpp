@@ -300,9 +300,13 @@ struct Completer::Impl {
       // Only now: every chunk of a level saw the same context.
       g->append(kept, *net);
       if (!listener) continue;
-      Growth all = *g;
-      if (s.hole_tau < s.tau) all.append(*dropped, *net);  // closing holes asks for them
-      listener(all.grid, level + 1);
+      if (s.hole_tau < s.tau) {  // closing holes asks for what was dropped
+        Growth all = *g;
+        all.append(*dropped, *net);
+        listener(all.grid, level + 1);
+      } else {
+        listener(g->grid, level + 1);
+      }
     }
   }
 
