@@ -97,6 +97,11 @@ ObservationSettings Encoder::observationSettings() const {
   return s;
 }
 
+std::vector<float> Encoder::colourWay() const {
+  const Tensor w = impl_->net->colour_shortcut->weight.detach().contiguous();
+  return {w.data_ptr<float>(), w.data_ptr<float>() + w.numel()};
+}
+
 LatentGrid Encoder::encode(const std::vector<View>& views, const Observation& o,
                            Progress& progress) const {
   torch::NoGradGuard no_grad;
@@ -173,9 +178,7 @@ DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen
     const int side = 1 << (c.levels - 1 - split);  // of a child, in voxels
     auto activeBelow = [&](const auto& mask, const Coord& child) {
       int active = 0;
-      for (int v = 0; v < side * side * side; ++v)
-        active += mask.isValueOn(Coord(child.x() * side + v / (side * side),
-                                       child.y() * side + v / side % side, child.z() * side + v % side));
+      for (int v = 0; v < side * side * side; ++v) active += mask.isValueOn(voxelOf(child, side, v));
       return active;
     };
     Children kept;

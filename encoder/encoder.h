@@ -68,6 +68,10 @@ class Encoder {
   LatentGrid encode(const std::vector<View>& views, const Observation& observation,
                     Progress& progress) const;
 
+  /// What the decoder's linear way makes of a latent, the mean colours of its octants: [24 * latent_dim], a row a
+  /// channel (opponent colours).
+  std::vector<float> colourWay() const;
+
   /// Splits every token and makes M Gaussians a voxel. Voxels in `seen.filled` are kept exactly, in
   /// observed nodes nothing that `seen.empty` holds is filled, other children where BCE-up exceeds
   /// `child_threshold`; a generated token keeps at least its likeliest child.

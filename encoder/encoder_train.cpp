@@ -59,8 +59,7 @@ std::pair<Tensor, Tensor> childTruth(const std::vector<Coord>& coords, int level
       if (*t) continue;
       *k = true;
       for (int v = 0; v < side * side * side && *k; ++v)
-        *k = empty.isValueOn(Coord(child.x() * side + v / (side * side),
-                                   child.y() * side + v / side % side, child.z() * side + v % side));
+        *k = empty.isValueOn(voxelOf(child, side, v));
     }
   return {truth, known};
 }

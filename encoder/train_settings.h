@@ -36,6 +36,7 @@ struct TrainSettings {
   int64_t checkpoint_every = 250;
   uint64_t seed = 1;
   bool resume = false;
+  std::string from;             // weights to start from instead of random ones; "" or of the same shapes
   std::map<std::string, std::string> metadata;  // goes into the weights: scenes trained on, ...
 };
 

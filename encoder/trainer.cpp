@@ -77,7 +77,8 @@ void Trainer::update() {
     std::vector<Tensor> average = average_->parameters();
     updateAverage(average, net_->parameters(), decay);
   }
-  optimiser_.zero_grad();
+  // To none, as a run that goes on finds them: what gets no gradient in a step is left alone, momentum too.
+  for (const Tensor& p : net_->parameters()) p.mutable_grad() = Tensor();
   ++step_;
   auto add = [&](const std::string& name, double value) {
     running_[name].first += value;

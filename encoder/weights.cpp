@@ -1,6 +1,5 @@
 #include "encoder/weights.h"
 
-#include <cstdio>
 #include <filesystem>
 #include <fstream>
 #include <nlohmann/json.hpp>
@@ -132,10 +131,7 @@ void loadModule(torch::nn::Module& module, const std::string& prefix, const Tens
 
 std::string weightsHash(const torch::nn::Module& module) {
   uint64_t hash = 1469598103934665603ull;
-  auto add = [&](const void* data, size_t bytes) {
-    for (size_t i = 0; i < bytes; ++i)
-      hash = (hash ^ static_cast<const unsigned char*>(data)[i]) * 1099511628211ull;
-  };
+  auto add = [&](const void* data, size_t bytes) { hash = fnv1a(data, bytes, hash); };
   auto addTensor = [&](const std::string& name, const Tensor& value) {
     const Tensor t = value.detach().contiguous();
     add(name.data(), name.size());
@@ -143,9 +139,7 @@ std::string weightsHash(const torch::nn::Module& module) {
   };
   for (const auto& p : module.named_parameters()) addTensor(p.key(), p.value());
   for (const auto& b : module.named_buffers()) addTensor(b.key(), b.value());
-  char text[17];
-  std::snprintf(text, sizeof text, "%016llx", static_cast<unsigned long long>(hash));
-  return text;
+  return hexOf(hash);
 }
 
 }  // namespace vdbc

@@ -1,16 +1,18 @@
 #!/bin/sh
 # The completer's study: every method on held-out rooms with 1 to 12 views in, and on example homes; charts against the
-# number of views (bars: standard error over the same rooms), the reliability of the stored probabilities, and tables of
-# two views. Can be stopped and started again: finished parts stay; delete their .jsonl after the weights have changed.
-# One thread, well over an hour. The charts need gnuplot.
-#   sh examples/study.sh [FOLDER, default docs: writes completion.svg, results/completion.md, results/completion-*.jsonl]
-# ROOMS (1-8), MORE_ROOMS (9-64, at two views) and HOMES (0-7) choose other scenes, VIEWS other numbers of views for the
-# curves.
+# number of views (bars: standard error over the same rooms), the reliability of the stored probabilities, tau against the
+# number of views, and tables. Can be stopped and started again: finished parts stay; delete their .jsonl after the weights
+# have changed. One thread, well over an hour. The charts need gnuplot.
+#   sh examples/study.sh [FOLDER, default docs: writes completion.svg, tau.svg, results/completion.md, results/completion-*.jsonl]
+# ROOMS (1-16, with several tau), MORE_ROOMS (17-64) and HOMES (0-23, at two views) choose other scenes, VIEWS other numbers
+# of views. PARTS="rooms:1-16/2 ..." makes just those parts, so that several processes can share the work.
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
 folder=${1:-$root/docs}
 program=${VDB_COMPLETE:-$root/build/release/vdb_complete}
 views="${VIEWS:-1 2 4 8 12}"
+taus=".1 .2 .3 .4 .5 .6"
+some=rooms:${ROOMS:-1-16} more=rooms:${MORE_ROOMS:-17-64} all_homes=homes:${HOMES:-0-23}
 data=$root/out/study
 mkdir -p "$folder/results" "$data"
 results=$(CDPATH='' cd -- "$folder/results" && pwd -P)
@@ -22,8 +24,11 @@ fileOf() { echo "$results/completion-$(echo "$1" | tr : _)-$2.jsonl"; }
 part() {
   if [ -s "$(fileOf "$1" "$2")" ]; then return; fi
   echo "$1, $2 views" >&2
-  "$program" eval --scenes "$1" --views "$2" --threads 1 --json 2>>"$data/eval.log" >"$data/part.jsonl"
-  mv "$data/part.jsonl" "$(fileOf "$1" "$2")"
+  sweep=
+  [ "$1" = "$some" ] && sweep="--taus $taus"
+  # shellcheck disable=SC2086  # one word each
+  "$program" eval --scenes "$1" --views "$2" --threads 1 $sweep --json 2>>"$data/eval.log" >"$data/part-$$.jsonl"
+  mv "$data/part-$$.jsonl" "$(fileOf "$1" "$2")"
 }
 
 # statistics FILE...: a line "method score scenes mean deviation" for each number of the scenes' results.
@@ -72,13 +77,15 @@ reliability() {
     END { for (i = 1; i <= 10; ++i) if (count[i] > 0) print sum[i] / count[i], hits[i] / count[i], count[i] }'
 }
 
-some=rooms:${ROOMS:-1-8} more=rooms:${MORE_ROOMS:-9-64} all_homes=homes:${HOMES:-0-7}
-part "$some" 2
-part "$more" 2
+if [ -n "${PARTS:-}" ]; then
+  for p in $PARTS; do part "${p%/*}" "${p#*/}"; done
+  exit
+fi
+for n in 2 $views; do part "$some" "$n"; part "$more" "$n"; done
 part "$all_homes" 2
-for n in $views; do part "$some" "$n"; done
 
-rooms="$(fileOf "$some" 2) $(fileOf "$more" 2)"
+roomsOf() { echo "$(fileOf "$some" "$1") $(fileOf "$more" "$1")"; }
+rooms=$(roomsOf 2)
 homes=$(fileOf "$all_homes" 2)
 # shellcheck disable=SC2086  # two files
 {
@@ -87,13 +94,21 @@ homes=$(fileOf "$all_homes" 2)
   table $rooms
   printf '\n%s rooms of example homes:\n\n' "$(scenes "$homes")"
   table "$homes"
+  for n in $views; do
+    # shellcheck disable=SC2046  # two files
+    [ "$n" = 2 ] || { printf '\nThe rooms, %s in:\n\n' "$n"; table $(roomsOf "$n"); }
+  done
 } >"$data/completion.md"
 mv "$data/completion.md" "$results/completion.md"
 
-rm -f "$data"/curve-*
+rm -f "$data"/curve-* "$data"/tau-*
 for n in $views; do
-  statistics "$(fileOf "$some" "$n")" | while read -r method score count mean deviation; do
-    echo "$n $count $mean $deviation" | awk '{ print $1, $3, $4 / sqrt($2) }' >>"$data/curve-$method-$score"
+  # shellcheck disable=SC2046  # two files
+  statistics $(roomsOf "$n") | while read -r method score count mean deviation; do
+    case $method in
+      completed-tau-*) echo "$n ${method#completed-tau-} $mean" >>"$data/tau-$score" ;;
+      *) echo "$n $count $mean $deviation" | awk '{ print $1, $3, $4 / sqrt($2) }' >>"$data/curve-$method-$score" ;;
+    esac
   done
 done
 # shellcheck disable=SC2086
@@ -127,5 +142,25 @@ set key top left font ",10"
 plot x with lines lc "gray" dt 2 title "calibrated", "curve-rooms" with linespoints lw 1.5 pt 7 ps .5 lc 5 title "rooms", \
   "curve-homes" with linespoints lw 1.5 pt 7 ps .5 lc 3 title "homes"
 PLOT
-mv completion.svg "$results/../completion.svg"
+gnuplot <<'PLOT'
+set terminal svg size 1350,380 font "sans,13" background "white"
+set output "tau.svg"
+set multiplot layout 1,4 margins .05,.98,.14,.86 spacing .06
+scores = "psnr ssim flip f1"
+titles = "'PSNR [dB]' 'SSIM' 'FLIP (low is good)' 'Strict F1 of unseen nodes'"
+formats = "'%.2f' '%.3f' '%.3f' '%.3f'"
+set xlabel "views in"; set ylabel "tau"
+unset key; unset colorbox
+set xrange [-.5:4.5]; set yrange [.05:.65]
+set xtics ("1" 0, "2" 1, "4" 2, "8" 3, "12" 4)
+place(n) = n > 8 ? 4 : n > 4 ? 3 : n > 2 ? 2 : n > 1 ? 1 : 0
+do for [s = 1:4] {
+  set title word(titles, s)
+  # Colours are per number of views: darkest the best tau of its column.
+  if (s == 3) { set palette defined (0 "#6baed6", 1 "white") } else { set palette defined (0 "white", 1 "#6baed6") }
+  plot "< awk 'NR == FNR { if (!($1 in low) || $3 < low[$1]) low[$1] = $3; if (!($1 in high) || $3 > high[$1]) high[$1] = $3; next } { print $1, $2, $3, high[$1] > low[$1] ? ($3 - low[$1]) / (high[$1] - low[$1]) : 0 }' tau-".word(scores, s)." tau-".word(scores, s) \
+    using (place($1)):2:4 with image, "tau-".word(scores, s) using (place($1)):2:(sprintf(word(formats, s), $3)) with labels font ",11"
+}
+PLOT
+mv completion.svg tau.svg "$results/.."
 cat "$results/completion.md"

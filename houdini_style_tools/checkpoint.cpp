@@ -13,15 +13,6 @@ using nlohmann::json;
 namespace {
 constexpr const char* kNextLevel = "next_level";
 
-// Hexadecimal.
-std::string hashOf(const std::string& bytes) {
-  const std::string sum = checksumTrailer(bytes.data(), bytes.size());
-  std::string text;
-  for (size_t i = sum.size() - sizeof(uint64_t); i < sum.size(); ++i)
-    for (int digit : {uint8_t(sum[i]) >> 4, uint8_t(sum[i]) & 15}) text += "0123456789abcdef"[digit];
-  return text;
-}
-
 template <typename T>
 void appendBytes(const std::vector<T>& values, std::string* bytes) {
   static_assert(std::is_standard_layout_v<T>, "expected plain numbers");
@@ -33,13 +24,13 @@ std::string hashOf(const LatentGrid& g) {
   appendBytes(std::vector<Coord>{g.frame.bounds.min(), g.frame.bounds.max()}, &bytes);
   appendBytes(g.ijk, &bytes), appendBytes(g.z, &bytes), appendBytes(g.observed, &bytes);
   appendBytes(g.probability, &bytes), appendBytes(g.bfs_level, &bytes);
-  return hashOf(bytes);
+  return hexOf(fnv1a(bytes.data(), bytes.size()));
 }
 
 std::string hashOf(const TokenMask& mask) {
   std::string bytes;
   appendBytes(activeCoords(mask), &bytes);
-  return hashOf(bytes);
+  return hexOf(fnv1a(bytes.data(), bytes.size()));
 }
 }  // namespace
 

@@ -348,7 +348,8 @@ std::string reliabilityJson(const MethodResult& r) {
 
 std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Encoder& encoder,
                                         const Completer& completer, const SceneSettings& settings,
-                                        const std::string& picture, Progress& progress, const UserNets& nets) {
+                                        const std::vector<double>& taus, const std::string& picture,
+                                        Progress& progress, const UserNets& nets) {
   SceneSettings s = settings;
   s.volume.up = scene.up;
 
@@ -364,7 +365,7 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   std::vector<MethodResult> results;
   std::vector<std::vector<Image>> columns(1);
   for (size_t i = 0; i < std::min(kShownViews, scene.targets.size()); ++i) columns[0].push_back(scene.targets[i].colour);
-  auto add = [&](const char* method, const MethodOutput& output, double seconds) {
+  auto add = [&](const std::string& method, const MethodOutput& output, double seconds) {
     MethodResult r;
     r.scene = scene.name, r.method = method, r.views = int(scene.input.size());
     r.gaussians = output.gaussians.size();
@@ -414,6 +415,13 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
     add("oracle-occupancy", {d.gaussians, d.voxels}, observed_seconds + secondsSince(start));
   }
   if (!picture.empty()) writeColumns(columns, picture);
+  for (double tau : taus) {
+    s.completion.tau = float(tau);
+    start = std::chrono::steady_clock::now();
+    const Completion other = completeLatents(c.seen, c.space, encoder, completer, s, progress);
+    add(joinText("completed-tau-", tau), {other.whole_decoded.gaussians, other.whole_decoded.voxels},
+        observed_seconds + secondsSince(start));
+  }
   return results;
 }
 

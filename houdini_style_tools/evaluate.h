@@ -110,11 +110,13 @@ std::string resultJson(const MethodResult& result);
 /// One JSON object: scene, views, method and, a bin, [count, sum of probabilities, hits].
 std::string reliabilityJson(const MethodResult& result);
 
-/// Methods: observed, pixel-aligned, nearest, box, completed, oracle-occupancy (rooms only). With a `picture` writes a
-/// PNG: of at most four target views the truth, then a column a method but pixel-aligned, which looks like observed.
+/// Methods: observed, pixel-aligned, nearest, box, completed, oracle-occupancy (rooms only), and completed-tau-T for each
+/// T of `taus`. With a `picture` writes a PNG: of at most four target views the truth, then a column a method but
+/// pixel-aligned, which looks like observed.
 std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Encoder& encoder,
                                         const Completer& completer, const SceneSettings& settings,
-                                        const std::string& picture, Progress& progress, const UserNets& nets = {});
+                                        const std::vector<double>& taus, const std::string& picture,
+                                        Progress& progress, const UserNets& nets = {});
 
 /// Mean over scenes of each method, scene "mean"; values that are NaN in a scene are left out there.
 std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results);

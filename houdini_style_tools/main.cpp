@@ -18,6 +18,7 @@
 #include "houdini_style_tools/console.h"
 #include "houdini_style_tools/reconstruct.h"
 #include "houdini_style_tools/render.h"
+#include "houdini_style_tools/scores.h"
 #include "houdini_style_tools/scenes.h"
 #include "vdb/latent_vdb.h"
 #include "vdb/mask_vdb.h"
@@ -70,11 +71,13 @@ struct Check {
 struct Evaluate {
   std::string scenes, frames, weights, lpips, features, pictures;
   int views = 2;
-  bool reconstruct = false;
+  std::vector<double> taus;
+  int context_tokens = 0, chunk_tokens = 0;
+  bool random_order = false, reconstruct = false;
   double optimise_seconds = OptimiseSettings().seconds;
 };
 struct Train {
-  std::string output, work, cache, preset = "small", encoder;
+  std::string output, work, cache, preset = "small", encoder, from;
   std::vector<std::string> changes;
   int64_t steps = 0, scenes = 0, batch = 1;
   double rate = 0;
@@ -318,7 +321,7 @@ void cookComplete(const Complete& o, const Common& common, Progress& progress) {
   }
   if (o.samples > 1) writeOccupancyVdb(all.frame, samples, stem + kOccupancyEnding);
   const double seconds = secondsSince(begin);
-  made["seconds"] = seconds, made["output"] = stem;
+  made["seconds"] = seconds, made["peak_mb"] = peakMemoryMb(), made["output"] = stem;
   std::string files = joinText(stem, ".vdb  ", stem, ".points.vdb  ", stem, ".ply  ", stem, kLatentEnding);
   if (!from_latents) files += joinText("  ", stem, kPictureEnding);
   if (o.samples > 1)
@@ -467,6 +470,8 @@ void cookEvaluate(const Evaluate& o, const Complete& options, const Common& comm
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
   SceneSettings settings = sceneSettings(options, common, Eigen::Vector3d::UnitZ());
+  settings.completion.random_order = o.random_order;
+  settings.completion.context_tokens = o.context_tokens, settings.completion.chunk_tokens = o.chunk_tokens;
   std::vector<MethodResult> all;
   auto show = [&](const MethodResult& r) {
     if (common.json) {
@@ -490,7 +495,7 @@ void cookEvaluate(const Evaluate& o, const Complete& options, const Common& comm
     const EvaluationScene scene = scenes.scene(i);
     const std::string picture = pictureOf(o, i);
     for (const MethodResult& r : naming(scene.name, [&] {
-           return evaluateScene(scene, encoder, completer, settings, picture, progress, nets);
+           return evaluateScene(scene, encoder, completer, settings, o.taus, picture, progress, nets);
          })) {
       show(r);
       all.push_back(r);
@@ -558,7 +563,7 @@ TrainSettings trainSettings(const Train& t, const Common& common) {
   s.batch = t.batch, s.processes = processes(), s.mixed_precision = t.mixed_precision;
   if (s.batch % s.processes.size != 0)
     throw UsageError(joinText("--batch: expected a multiple of WORLD_SIZE ", s.processes.size, ", found ", s.batch));
-  s.steps = t.steps, s.learning_rate = t.rate, s.seed = common.seed, s.resume = t.resume;
+  s.steps = t.steps, s.learning_rate = t.rate, s.seed = common.seed, s.resume = t.resume, s.from = t.from;
   s.validate_every = std::clamp<int64_t>(t.steps / 8, 1, s.validate_every);
   return s;
 }
@@ -641,7 +646,7 @@ void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
     report(progress, int(100 * i / count));
   }
   progress.end();
-  trainCompleter(config, training, count, validation, kValidationRooms, s, trainListener(common.json), progress);
+  trainCompleter(config, encoder.colourWay(), training, count, validation, kValidationRooms, s, trainListener(common.json), progress);
 }
 
 // CLI::Range lets NaN pass.
@@ -760,9 +765,13 @@ void addEvaluate(CLI::App* verb, Evaluate* o, Complete* options) {
   verb->add_option("--lpips", o->lpips, "your TorchScript network of two pictures [none]");
   verb->add_option("--features", o->features, "your TorchScript network of one picture, for FID and KID [none]");
   addCompletion(verb, options);
+  verb->add_option("--taus", o->taus, "also completed with each of these --tau")->check(Between(0, 1));
+  verb->add_option("--context-tokens", o->context_tokens, "observed tokens around a chunk [as trained]")->check(CLI::Range(1, 1 << 20));
+  verb->add_option("--chunk-tokens", o->chunk_tokens, "targets of a chunk [as trained]")->check(CLI::Range(1, 1 << 20));
+  verb->add_flag("--random-order", o->random_order, "growth in random instead of breadth-first order");
   auto* reconstruct = verb->add_flag("--reconstruct", o->reconstruct, "no completion: what was observed, encoded and decoded, beside baselines");
   for (const char* of_completion : {"--lpips", "--features", "--tau", "--coarse-tau", "--hole-tau", "--sampling-steps",
-                                    "--temperature", "--generated-context", "--refine-observed"})
+                                    "--temperature", "--generated-context", "--refine-observed", "--taus", "--random-order", "--context-tokens", "--chunk-tokens"})
     reconstruct->excludes(verb->get_option(of_completion));
   verb->add_option("--optimise", o->optimise_seconds, "seconds a scene for the baseline of optimised Gaussians, 0 leaves it out")
       ->check(Between(0, 86400))->capture_default_str()->needs(reconstruct);
@@ -845,6 +854,7 @@ int run(int argc, char** argv) {
   CLI::App* train_mar = verb_train->add_subcommand("mar", "the masked auto-regressive completer");
   addTrain(train_mar, &train, 8000, 400, 8e-4);
   train_mar->add_option("--encoder", train.encoder, "encoder weights")->required();
+  train_mar->add_option("--from", train.from, "completer weights to start from [random]")->excludes(train_mar->get_option("--resume"));
   for (CLI::App* verb : {info, verb_encode, verb_decode, verb_rethreshold, verb_render, verb_check, verb_eval, train_encoder, train_mar}) addCommon(verb, &common);
 
   try {

@@ -159,9 +159,7 @@ SetScores splitScores(const TriangleMesh& truth, const Observation& o, const std
   const auto unseen = [&](const Coord& child) {
     if (o.tokens.row(level + 1, tokenCoord(child, 1)) < 0 || o.tokens.row(level, child) >= 0) return false;
     for (int v = 0; v < side * side * side; ++v)
-      if (!empty.isValueOn(Coord(child.x() * side + v / (side * side), child.y() * side + v / side % side,
-                                 child.z() * side + v % side)))
-        return true;
+      if (!empty.isValueOn(voxelOf(child, side, v))) return true;
     return false;
   };
   std::set<Coord> surface, filled;

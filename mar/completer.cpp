@@ -4,6 +4,7 @@
 #include <cmath>
 #include <map>
 #include <nlohmann/json.hpp>
+#include <random>
 #include <set>
 
 #include "encoder/weights.h"
@@ -41,6 +42,8 @@ void visitFields(Config& c, Visit&& visit) {
   visit("context_tokens", c.context_tokens), visit("empty_tokens", c.empty_tokens);
   visit("chunk_tokens", c.chunk_tokens), visit("coarse_empty_tokens", c.coarse_empty_tokens);
   visit("coarse_chunk_tokens", c.coarse_chunk_tokens);
+  visit("coarse_stage", c.coarse_stage);
+  visit("context_noise", c.context_noise), visit("context_false_positives", c.context_false_positives);
   visit("focal_gamma", c.focal_gamma), visit("focal_alpha", c.focal_alpha);
   visit("unobserved_weight", c.unobserved_weight);
 }
@@ -69,10 +72,10 @@ CompleterConfig CompleterConfig::fromJson(const std::string& text, const std::st
   within("coarse_width", c.coarse_width, 1, 4096), within("coarse_heads", c.coarse_heads, 1, 64);
   within("coarse_layers", c.coarse_layers, 1, 64);
   within("diffusion_width", c.diffusion_width, 1, 4096);
-  within("diffusion_steps", c.diffusion_steps, 2, 100000);
+  within("diffusion_steps", c.diffusion_steps, 2, 100000), within("diffusion_draws", c.diffusion_draws, 0, 1024);
   within("context_tokens", c.context_tokens, 1, 1 << 20);
   within("empty_tokens", c.empty_tokens, 0, 1 << 20), within("chunk_tokens", c.chunk_tokens, 1, 1 << 20);
-  within("coarse_empty_tokens", c.coarse_empty_tokens, 1, 1 << 20);
+  within("coarse_empty_tokens", c.coarse_empty_tokens, 0, 1 << 20);
   within("coarse_chunk_tokens", c.coarse_chunk_tokens, 1, 1 << 20);
   require((c.latent_groups == 0 || c.latent_dim % c.latent_groups == 0) && c.width % (2 * c.heads) == 0 && c.coarse_width % (2 * c.coarse_heads) == 0,
           "CompleterConfig: ", where, ": widths are not multiples of twice their heads, or the latents of their groups");
@@ -85,27 +88,6 @@ Eigen::Vector3d centreOf(const std::vector<Coord>& coords) {
   Eigen::Vector3d sum = Eigen::Vector3d::Zero();
   for (const Coord& c : coords) sum += Eigen::Vector3d(c.x(), c.y(), c.z());
   return sum / double(coords.size());
-}
-
-// Equal parts of at most `size`, of tokens that lie together.
-std::vector<std::vector<Coord>> chunksOf(const std::vector<Coord>& tokens, int64_t size) {
-  const Tensor order = zOrder(tokens);
-  const int64_t n = int64_t(tokens.size()), count = (n + size - 1) / size;
-  std::vector<std::vector<Coord>> chunks(static_cast<size_t>(count));
-  for (int64_t c = 0; c < count; ++c)
-    for (int64_t i = c * n / count; i < (c + 1) * n / count; ++i)
-      chunks[size_t(c)].push_back(tokens[size_t(order.data_ptr<int64_t>()[i])]);
-  return chunks;
-}
-
-// The states inside a box of voxels.
-NodeStates partOf(const NodeStates& s, const CoordBBox& voxels) {
-  NodeStates part;
-  part.level = s.level;
-  part.box = CoordBBox(tokenCoord(voxels.min(), s.level), tokenCoord(voxels.max(), s.level));
-  part.box.intersect(s.box);
-  for (auto node = part.box.begin(); node; ++node) part.states.push_back(s.at(*node));
-  return part;
 }
 
 }  // namespace
@@ -132,8 +114,8 @@ struct Completer::Impl {
   };
 
   // Standardised predictions as a file will hold them: a run that goes on from one sees the same numbers.
-  Tensor asFiled(const Tensor& z) const {
-    return net->restore(net->project(z)).to(torch::kHalf).to(torch::kFloat32).contiguous();
+  Tensor asFiled(const Tensor& z, bool project) const {
+    return net->restore(project ? net->project(z) : z).to(torch::kHalf).to(torch::kFloat32).contiguous();
   }
 
   // The growing grid, observed rows first; `z` [N, D] has its latents standardised.
@@ -218,6 +200,12 @@ struct Completer::Impl {
     }
   };
 
+  static std::vector<std::vector<Coord>> byWindow(const Scene& scene, const std::vector<Coord>& tokens) {
+    std::vector<std::vector<Coord>> parts(scene.windows.size());
+    for (const Coord& c : tokens) parts[scene.windowOf(c)].push_back(c);
+    return parts;
+  }
+
   static Scene sceneOf(const LatentGrid& start, const ObservedSpace& space) {
     return {sceneTokens(poolStates(start.frame, space, 1), poolStates(start.frame, space, 2)), windowsOf(start.frame), {}};
   }
@@ -225,17 +213,13 @@ struct Completer::Impl {
   void openGate(Scene* scene) const {
     for (const Coord& c : scene->tokens.coarse_filled) scene->gate[c] = 1;
     for (const Window& w : scene->windows) {
-      const SceneTokens part = sceneTokens(partOf(scene->tokens.nodes, w.frame.bounds),
-                                           partOf(scene->tokens.coarse, w.frame.bounds));
+      const SceneTokens part = sceneTokens(statesIn(scene->tokens.nodes, w.frame.bounds),
+                                           statesIn(scene->tokens.coarse, w.frame.bounds));
       if (part.coarse_filled.empty()) continue;  // nothing to grow from
       std::vector<Coord> unknown;
       for (const Coord& c : part.coarse_unknown)
         if (w.core.isInside(Coord(c.x() * 4, c.y() * 4, c.z() * 4))) unknown.push_back(c);
-      for (const std::vector<Coord>& targets : chunksOf(unknown, net->config.coarse_chunk_tokens)) {
-        const Tensor p = net->coarseLogits(coarseInputs(part, {}, targets, net->config.coarse_empty_tokens), w.frame)
-                             .sigmoid().contiguous();
-        for (size_t i = 0; i < targets.size(); ++i) scene->gate[targets[i]] = p.data_ptr<float>()[i];
-      }
+      net->coarseProbabilities(part, unknown, w.frame, &scene->gate);
     }
   }
 
@@ -246,7 +230,7 @@ struct Completer::Impl {
     std::array<TokenSet, kTokenKinds> in;
     std::vector<int64_t> rows[2];
     const std::vector<Coord>& context = s.generated_context ? g.grid.ijk : g.observed;
-    for (int64_t row : nearestRows(context, centre, net->config.context_tokens)) {
+    for (int64_t row : nearestRows(context, centre, s.context_tokens ? s.context_tokens : net->config.context_tokens)) {
       const int kind = row >= g.seeds();
       rows[kind].push_back(row);
       in[size_t(kind)].coords.push_back(context[size_t(row)]);
@@ -267,7 +251,7 @@ struct Completer::Impl {
     return {targets,
             {p.data_ptr<float>(), p.data_ptr<float>() + p.numel()},
             std::vector<int32_t>(targets.size(), level),
-            {asFiled(net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random))}};
+            {asFiled(net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random), s.generated_context)}};
   }
 
   // Visits candidates level by level; keeps those that `keep` accepts given their probability, the others
@@ -277,19 +261,20 @@ struct Completer::Impl {
   void grow(Growth* g, Tokens* dropped, const Scene& scene, const std::vector<Coord>& candidates,
             const CompleteSettings& s, Keep keep, Progress& progress, const LevelListener& listener) const {
     const std::set<Coord> done(g->grid.ijk.begin() + g->seeds(), g->grid.ijk.end());
-    const std::vector<int32_t> levels = breadthFirstLevels(candidates, g->observed, s.neighbours);
+    std::vector<int32_t> levels = breadthFirstLevels(candidates, g->observed, s.neighbours);
+    if (s.random_order) std::shuffle(levels.begin(), levels.end(), std::mt19937_64(s.seed));
     const int32_t last = levels.empty() ? 0 : *std::max_element(levels.begin(), levels.end());
     for (int32_t level = std::max(1, s.first_level); level <= last; ++level) {
       report(progress, int(100 * (level - 1) / last));
       // A generator a level: a run that goes on from a level draws what the whole one would have drawn.
       torch::Generator random = at::detail::createCPUGenerator(s.seed * 1000003 + uint64_t(level));
-      std::vector<std::vector<Coord>> frontier(scene.windows.size());
+      std::vector<Coord> frontier;
       for (size_t i = 0; i < candidates.size(); ++i)
         if (levels[i] == level && !done.count(candidates[i]) && (!s.region || s.region->isValueOn(candidates[i])))
-          frontier[scene.windowOf(candidates[i])].push_back(candidates[i]);
+          frontier.push_back(candidates[i]);
       Tokens kept;
-      for (const std::vector<Coord>& part : frontier)
-        for (const std::vector<Coord>& targets : chunksOf(part, net->config.chunk_tokens)) {
+      for (const std::vector<Coord>& part : byWindow(scene, frontier))
+        for (const std::vector<Coord>& targets : chunksOf(part, s.chunk_tokens ? s.chunk_tokens : net->config.chunk_tokens)) {
           report(progress, -1);
           const Tokens p = predict(*g, scene, targets, level, s, random);
           std::vector<int64_t> rows[2];
@@ -327,30 +312,30 @@ struct Completer::Impl {
   // Condition latents rewritten from everything that was decoded (spec A8), chunk by chunk.
   void refine(Growth* g, const Scene& scene, const CompleteSettings& s) const {
     torch::Generator random = at::detail::createCPUGenerator(s.seed + 1);
-    const std::vector<Coord>& ijk = g->grid.ijk;
     const int64_t seeds = g->seeds();
-    const Tensor order = zOrder(g->observed);
-    const std::vector<Coord> generated(ijk.begin() + seeds, ijk.end());
+    const std::vector<Coord> generated(g->grid.ijk.begin() + seeds, g->grid.ijk.end());
+    std::map<Coord, int64_t> row_of;
+    for (int64_t i = 0; i < seeds; ++i) row_of[g->observed[size_t(i)]] = i;
     Tensor refined = g->z.slice(0, 0, seeds).clone();
-    const int64_t chunk = net->config.chunk_tokens;
-    for (int64_t begin = 0; begin < seeds; begin += chunk) {
-      const Tensor rows = order.slice(0, begin, std::min(seeds, begin + chunk));
-      std::array<TokenSet, kTokenKinds> in;
-      for (int64_t i = 0; i < rows.size(0); ++i) in[kCondition].coords.push_back(ijk[size_t(rows[i].item<int64_t>())]);
-      const Eigen::Vector3d centre = centreOf(in[kCondition].coords);
-      in[kCondition].features = g->z.index_select(0, rows);
-      std::vector<int64_t> near = nearestRows(generated, centre, net->config.context_tokens);
-      for (int64_t& row : near) {
-        in[kVisible].coords.push_back(generated[size_t(row)]);
-        row += seeds;
+    for (const std::vector<Coord>& part : byWindow(scene, g->observed))
+      for (const std::vector<Coord>& tokens : chunksOf(part, net->config.chunk_tokens)) {
+        const Eigen::Vector3d centre = centreOf(tokens);
+        std::array<TokenSet, kTokenKinds> in;
+        std::vector<int64_t> rows, near = nearestRows(generated, centre, net->config.context_tokens);
+        for (const Coord& c : tokens) rows.push_back(row_of.at(c));
+        for (int64_t& row : near) {
+          in[kVisible].coords.push_back(generated[size_t(row)]);
+          row += seeds;
+        }
+        in[kCondition] = {g->z.index_select(0, torch::tensor(rows)), tokens};
+        in[kVisible].features = g->z.index_select(0, torch::tensor(near, torch::kInt64));
+        for (int64_t row : nearestRows(scene.tokens.empty_shell, centre, net->config.empty_tokens))
+          in[kEmptyToken].coords.push_back(scene.tokens.empty_shell[size_t(row)]);
+        in[kTarget].features = torch::zeros({0, 1});
+        const CompleterNet::Fine f = net->fine(in, scene.windows[scene.windowOf(tokens[0])].frame);
+        refined.index_copy_(0, torch::tensor(rows),
+                            net->project(net->refinement->sample(f.conditions, s.sampling_steps, s.temperature, random)));
       }
-      in[kVisible].features = g->z.index_select(0, torch::tensor(near, torch::kInt64));
-      for (int64_t row : nearestRows(scene.tokens.empty_shell, centre, net->config.empty_tokens))
-        in[kEmptyToken].coords.push_back(scene.tokens.empty_shell[size_t(row)]);
-      in[kTarget].features = torch::zeros({0, 1});
-      const CompleterNet::Fine f = net->fine(in, scene.windows[scene.windowOf(in[kCondition].coords[0])].frame);
-      refined.index_copy_(0, rows, net->project(net->refinement->sample(f.conditions, s.sampling_steps, s.temperature, random)));
-    }
     const Tensor z = net->restore(refined).to(torch::kHalf).to(torch::kFloat32).contiguous();
     std::copy_n(z.data_ptr<float>(), z.numel(), g->grid.z.begin());
   }

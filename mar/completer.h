@@ -20,12 +20,15 @@ struct CompleterConfig {
   bool paper_snr_weight = false;  // SNR / (1 + SNR) instead of min(1 / alpha_bar, 20)
   bool rotary_positions = true;   // 3-D RoPE in self-attention
   bool position_code = true;      // sinusoidal code on every token
+  bool coarse_stage = true;       // false: one dense stage, every unobserved token is a candidate
   // What the fine stage sees around a chunk of targets, nearest first.
   int context_tokens = 384, empty_tokens = 64, chunk_tokens = 160;
   int coarse_empty_tokens = 256, coarse_chunk_tokens = 1024;
   // Loss.
   float focal_gamma = 0, focal_alpha = .5f;
   float unobserved_weight = .25f;  // of U, labelled empty; 0 masks U from the loss as in the paper
+  // Generated tokens in training's context, up to: deviation of noise on their latents, share of wrong ones.
+  float context_noise = .2f, context_false_positives = .06f;
 
   static CompleterConfig small() { return {}; }
   static CompleterConfig paper();
@@ -34,16 +37,18 @@ struct CompleterConfig {
 };
 
 struct CompleteSettings {
-  float tau = .4f;           // a token is kept if its occupancy probability exceeds this
-  float coarse_tau = .05f;   // the coarse stage's gate: high recall
+  float tau = .2f;           // a token is kept if its occupancy probability exceeds this
+  float coarse_tau = .1f;    // the coarse stage's gate: high recall
   /// Dropped tokens above this probability are taken back where they close a hole (a minimum cut between
   /// what was seen empty and the border of the volume); 1: none.
-  float hole_tau = .05f;
+  float hole_tau = .1f;
   Neighbours neighbours = Neighbours::kCorners26;
   int sampling_steps = 0;    // DDIM steps of the diffusion head; 0: its linear mean
   double temperature = 1;
   /// Generated tokens are context of the levels after them (A11), not only the observed ones.
   bool generated_context = false;
+  int context_tokens = 0, chunk_tokens = 0;  // of the fine stage instead of the weights' own; 0: those
+  bool random_order = false;     // growth levels in which tokens come at random, as large as the breadth-first ones
   bool refine_observed = false;  // rewrite condition latents with the refinement head (A8)
   uint64_t seed = 1;
   /// Tokens (coordinates of the latents' level) that may be generated; all where null.

@@ -13,10 +13,10 @@
 namespace vdbc {
 namespace {
 
-constexpr float kContextNoise = .2f;          // deviation added to visible latents, up to
-constexpr float kContextFalsePositives = .06f;  // wrong tokens among the visible ones, up to
-constexpr float kFrontierShare = .6f;         // of a chunk's targets, at most
-constexpr double kAlone = .75;                // of the samples: condition tokens are all that is visible
+constexpr float kFrontierShare = .6f;  // of a chunk's targets, at most
+constexpr double kAlone = .75;         // of the samples: condition tokens are all that is visible
+constexpr double kOwnGate = .75;       // of the second half's samples: the fine stage works behind the coarse one as it is
+constexpr double kWindows = .5;        // of the samples: looked at through another window
 
 double uniform(torch::Generator& random) { return torch::rand({1}, random).item<double>(); }
 double uniform(double low, double high, torch::Generator& random) {
@@ -47,7 +47,7 @@ CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const NodeStates& t
   return m;
 }
 
-FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& s,
+FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& s, double false_positives,
                       torch::Generator& random) {
   FineMask m;
   const double kind = uniform(random);
@@ -57,7 +57,7 @@ FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSamp
   const int32_t depth = int32_t(torch::randint(alone ? deepest : 6, {1}, random).item<int64_t>());
   const Tensor draws = torch::rand({int64_t(candidates.size()), 2}, random);
   const double hidden = uniform(.5, 1, random);
-  const double wrong = uniform(0, kContextFalsePositives, random);
+  const double wrong = uniform(0, false_positives, random);
   std::vector<Coord> open;
   for (size_t i = 0; i < candidates.size(); ++i) {
     const float* d = draws.data_ptr<float>() + 2 * i;
@@ -84,6 +84,23 @@ FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSamp
       (distance[i] == 1 ? m.frontier : m.others).push_back(open[i]);
   }
   return m;
+}
+
+CoordBBox drawBounds(const CompletionSample& s, torch::Generator& random) {
+  const VoxelFrame& frame = s.condition.frame;
+  if (uniform(random) >= kWindows) return frame.bounds;
+  const int outwards = int(2.8 / frame.voxel_m / 4), most = int(16 / frame.voxel_m / 4);
+  CoordBBox bounds = frame.bounds;
+  for (int axis = 0; axis < 3; ++axis) {
+    const int side = frame.bounds.dim()[axis] / 4;
+    auto move = [&](int room) { return int(torch::randint(-side / 4, room + 1, {1}, random).item<int64_t>()); };
+    const int low = move(std::clamp(most - side, 0, outwards)), high = move(std::clamp(most - side - low, 0, outwards));
+    bounds.min()[axis] -= 4 * low, bounds.max()[axis] += 4 * high;
+  }
+  const bool holds = std::any_of(s.condition.ijk.begin(), s.condition.ijk.end(), [&](const Coord& token) {
+    return bounds.isInside(Coord(2 * token.x(), 2 * token.y(), 2 * token.z()));
+  });
+  return holds ? bounds : frame.bounds;
 }
 
 namespace {
@@ -145,7 +162,7 @@ std::vector<Coord> nearestOf(const std::vector<Coord>& from, const Eigen::Vector
 }
 
 // The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities there.
-Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s,
+Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s, const VoxelFrame& frame,
                   torch::Generator& random, std::map<Coord, float>* gate) {
   for (const Coord& c : scene.coarse_filled) (*gate)[c] = 1;
   CoarseMask mask = drawCoarseMask(scene.coarse_unknown, s.target_coarse, random);
@@ -156,7 +173,7 @@ Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionS
   const std::vector<Coord> targets = nearestOf(mask.targets, {double(around.x()), double(around.y()), double(around.z())},
                                                net.config.coarse_chunk_tokens);
   const Tensor logits = net.coarseLogits(
-      coarseInputs(scene, mask.visible, targets, net.config.coarse_empty_tokens), s.condition.frame);
+      coarseInputs(scene, mask.visible, targets, net.config.coarse_empty_tokens), frame);
   const Tensor p = logits.detach().sigmoid().contiguous();
   for (size_t i = 0; i < targets.size(); ++i) (*gate)[targets[i]] = p.data_ptr<float>()[i];
   // Positions not worked on get the probability that a middling coarse stage would give them, so that the
@@ -174,23 +191,38 @@ Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionS
                        net.config);
 }
 
-Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generator& random) {
+Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& colour_way, double own_gate,
+                    torch::Generator& random) {
   const CompleterConfig& c = net.config;
-  const SceneTokens scene = sceneTokens(s.seen_nodes, s.seen_coarse);
+  VoxelFrame frame = s.condition.frame;
+  frame.bounds = drawBounds(s, random);
+  const SceneTokens scene = sceneTokens(statesIn(s.seen_nodes, frame.bounds), statesIn(s.seen_coarse, frame.bounds));
   std::map<Coord, float> gate;
   Losses l;
-  l.coarse = coarseLoss(net, scene, s, random, &gate);
+  l.coarse = c.coarse_stage ? coarseLoss(net, scene, s, frame, random, &gate) : torch::zeros({});
   l.fine = l.linear = l.diffusion = l.refinement = torch::zeros({});
 
-  // The fine stage works inside what the coarse stage keeps: here the truth, and what it takes for true.
-  const double tau = uniform(.05, .5, random);
+  // The fine stage works inside what the coarse stage keeps, as it is or as a better one would be: all of the truth and
+  // what it takes for true.
+  const bool own = !c.coarse_stage || uniform(random) < own_gate;
+  const double tau = own ? CompleteSettings().coarse_tau : uniform(.05, .5, random);
+  if (own) {
+    torch::NoGradGuard no_grad;
+    gate.clear();
+    for (const Coord& node : scene.coarse_filled) gate[node] = 1;
+    // What a larger window adds is all unseen: none of it is worth the fine stage's time.
+    std::vector<Coord> near;
+    for (const Coord& node : scene.coarse_unknown)
+      if (s.seen_coarse.box.isInside(node)) near.push_back(node);
+    net.coarseProbabilities(scene, near, frame, &gate);
+  }
   std::vector<Coord> open;
   for (const auto& [node, probability] : gate)
-    if (probability > tau || s.target_coarse.at(node) == NodeState::kFilled) open.push_back(node);
+    if (probability > tau || (!own && s.target_coarse.at(node) == NodeState::kFilled)) open.push_back(node);
   const std::vector<Coord> candidates = unobservedChildren(open, scene.nodes);
   const TargetRows rows(s);
   if (candidates.empty() || rows.all.empty()) return l;
-  const FineMask m = drawFineMask(candidates, s, random);
+  const FineMask m = drawFineMask(candidates, s, c.context_false_positives, random);
   const std::vector<Coord>& around = m.frontier.empty() ? m.others : m.frontier;
   if (around.empty()) return l;
 
@@ -226,7 +258,7 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generat
   const Tensor target_z = net.standardise(torch::tensor(s.target.z).view({s.target.size(), -1}));
   in[kCondition].features = condition_z.index_select(0, torch::tensor(condition_rows, torch::kInt64));
   in[kVisible].features = target_z.index_select(0, torch::tensor(visible_rows, torch::kInt64));
-  in[kVisible].features = in[kVisible].features + uniform(0, kContextNoise, random) *
+  in[kVisible].features = in[kVisible].features + uniform(0, c.context_noise, random) *
                                                       torch::randn(in[kVisible].features.sizes(), random);
   in[kEmptyToken].coords = nearestOf(scene.empty_shell, centre, c.empty_tokens);
   std::vector<float> parent_probability;
@@ -236,7 +268,7 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generat
   }
   in[kTarget] = {torch::tensor(parent_probability).unsqueeze(1), targets};
 
-  const CompleterNet::Fine f = net.fine(in, s.condition.frame);
+  const CompleterNet::Fine f = net.fine(in, frame);
   l.fine = occupancyLoss(f.logits, labelsOf(targets, s.target_nodes, c.unobserved_weight), c);
 
   const SnrWeight weight = c.paper_snr_weight ? SnrWeight::kSnr : SnrWeight::kInverse;
@@ -248,7 +280,7 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generat
     }
     if (token_rows.empty()) return DiffusionHead::Loss{torch::zeros({}), torch::zeros({})};
     return head.loss(tokens.index_select(0, torch::tensor(token_rows)),
-                     target_z.index_select(0, torch::tensor(target_rows)), c.diffusion_draws, weight, random);
+                     target_z.index_select(0, torch::tensor(target_rows)), colour_way, c.diffusion_draws, weight, random);
   };
   const auto latent = latentLoss(*net.diffusion, f.targets, targets);
   l.linear = latent.linear, l.diffusion = latent.diffusion;
@@ -260,16 +292,22 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, torch::Generat
   return l;
 }
 
-// Mean and deviation of the target latents over some samples.
-void fitLatentScale(CompleterNet& net, const SampleSource& samples, int64_t count) {
+// Target latents of some samples.
+Tensor someLatents(const SampleSource& samples, int64_t count) {
   std::vector<Tensor> all;
   for (int64_t i = 0; i < std::min<int64_t>(count, 32); ++i) {
     const CompletionSample s = samples(uint64_t(i));
     all.push_back(torch::tensor(s.target.z).view({s.target.size(), -1}));
   }
-  const Tensor z = torch::cat(all);
-  net.latent_mean.copy_(z.mean(0));
-  net.latent_deviation.copy_(z.std(0).clamp_min(1e-3));
+  return torch::cat(all);
+}
+
+// The colour way [K, D] as a function of standardised latents, each row's results of unit deviation: where walls are
+// white and floors brown, a tint is a small error of few channels and a large one of these.
+Tensor colourWayOf(const std::vector<float>& rows, const Tensor& latents, const CompleterNet& net) {
+  const Tensor way = torch::tensor(rows).view({-1, latents.size(1)});
+  const Tensor deviation = torch::matmul(latents, way.t()).std(0).clamp_min(1e-3);
+  return way * net.latent_deviation / deviation.unsqueeze(1);
 }
 
 // Roll-outs on validation samples: precision, recall, F1 on the nodes that were unobserved.
@@ -321,18 +359,22 @@ ObservedSpace nodeSpace(const CompletionSample& s) {
 
 }  // namespace
 
-void trainCompleter(const CompleterConfig& config, const SampleSource& samples, int64_t sample_count,
+void trainCompleter(const CompleterConfig& config, const std::vector<float>& colour_way, const SampleSource& samples, int64_t sample_count,
                     const SampleSource& validation, int validation_count, const TrainSettings& settings,
                     const TrainListener& listener, Progress& progress) {
   torch::manual_seed(settings.seed);
   auto net = std::make_shared<CompleterNet>(config), average = std::make_shared<CompleterNet>(config);
-  if (!settings.resume) {
+  const Tensor latents = someLatents(samples, sample_count);
+  if (!settings.from.empty()) {
+    const TensorFile start = readTensors(settings.from);
+    for (CompleterNet* n : {net.get(), average.get()}) loadModule(*n, "", start, settings.from);
+  } else if (!settings.resume) {
     torch::NoGradGuard no_grad;
-    fitLatentScale(*net, samples, sample_count);
-    average->latent_mean.copy_(net->latent_mean);
-    average->latent_deviation.copy_(net->latent_deviation);
+    for (CompleterNet* n : {net.get(), average.get()})
+      n->latent_mean.copy_(latents.mean(0)), n->latent_deviation.copy_(latents.std(0).clamp_min(1e-3));
   }
   Trainer trainer(net, average, "completer", config.toJson(), settings, listener);
+  const Tensor colours = colourWayOf(colour_way, latents, *net);
   std::vector<CompletionSample> held_out;
   std::vector<ObservedSpace> spaces;
   for (int i = 0; i < validation_count; ++i) {
@@ -354,10 +396,12 @@ void trainCompleter(const CompleterConfig& config, const SampleSource& samples, 
     const int64_t first = trainer.firstSample();
     const std::vector<CompletionSample> current = next.valid() ? next.get() : load(first);
     next = std::async(std::launch::async, load, first + settings.batch);
+    // Before the coarse stage is any good, there is nothing behind it to learn from.
+    const double own_gate = 2 * trainer.step() < settings.steps ? 0 : kOwnGate;
     for (size_t k = 0; k < current.size(); ++k) {
       torch::Generator random = at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(first) + k);
       const MixedPrecision mixed(settings.mixed_precision);
-      const Losses l = sampleLosses(*net, current[k], random);
+      const Losses l = sampleLosses(*net, current[k], colours, own_gate, random);
       const Tensor total = l.total();
       trainer.addSample(total, {{"loss", total.item<double>()}, {"coarse", l.coarse.item<double>()},
                                 {"fine", l.fine.item<double>()}, {"linear", l.linear.item<double>()},
@@ -378,6 +422,7 @@ CompleterStep completerStep(const CompleterConfig& config, const CompletionSampl
   torch::manual_seed(seed);
   auto net = std::make_shared<CompleterNet>(config);
   torch::optim::AdamW optimiser(net->parameters(), torch::optim::AdamWOptions(1e-3));
+  const Tensor colours = torch::eye(config.latent_dim).slice(0, 0, 1);
   CompleterStep result;
   auto gradientSum = [](torch::nn::Module& module) {
     double sum = 0;
@@ -388,7 +433,7 @@ CompleterStep completerStep(const CompleterConfig& config, const CompletionSampl
   for (double* loss : {&result.before, &result.after}) {
     optimiser.zero_grad();
     torch::Generator random = at::detail::createCPUGenerator(seed);
-    const Losses l = sampleLosses(*net, sample, random);
+    const Losses l = sampleLosses(*net, sample, colours, kOwnGate, random);
     *loss = l.total().item<double>();
     if (loss == &result.before && l.refinement.requires_grad()) {
       l.refinement.backward({}, true);

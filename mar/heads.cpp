@@ -78,11 +78,13 @@ Tensor DiffusionHead::noise(const Tensor& x, const Tensor& t, const Tensor& h) {
   return out->forward(normed(y) * (1 + m[1]) + m[0]);
 }
 
-DiffusionHead::Loss DiffusionHead::loss(const Tensor& h, const Tensor& target, int draws,
+DiffusionHead::Loss DiffusionHead::loss(const Tensor& h, const Tensor& target, const Tensor& colour_way, int draws,
                                         SnrWeight kind, torch::Generator& random) {
   Loss l;
-  const Tensor predicted = mean(h);
-  l.linear = (predicted - target).square().mean();
+  const Tensor predicted = mean(h), error = predicted - target;
+  l.linear = error.square().mean() + torch::matmul(error, colour_way.t()).square().mean();
+  l.diffusion = torch::zeros({});
+  if (draws == 0) return l;
   const Tensor x0 = (target - predicted).detach().repeat({draws, 1});
   const Tensor t = torch::randint(steps, {x0.size(0)}, random, torch::kInt64);
   const Tensor bar = alpha_bar.index_select(0, t).unsqueeze(1);

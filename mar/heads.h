@@ -37,9 +37,11 @@ struct DiffusionHead : torch::nn::Module {
   struct Loss {
     Tensor linear, diffusion;
   };
-  /// Squared errors, mean over tokens and channels; `draws` noise levels a token. Behind the linear mean
-  /// is a stop-gradient.
-  Loss loss(const Tensor& h, const Tensor& target, int draws, SnrWeight weight, torch::Generator& random);
+  /// Squared errors, mean over tokens and channels, of the linear mean also over its colours: `colour_way` [K, D] makes
+  /// them. `draws` noise levels a token (0: the linear mean alone).
+  /// Behind the linear mean is a stop-gradient.
+  Loss loss(const Tensor& h, const Tensor& target, const Tensor& colour_way, int draws, SnrWeight weight,
+            torch::Generator& random);
   /// `sampling_steps` deterministic (DDIM) steps from noise of deviation `temperature`; 0 steps, or
   /// temperature 0, is the linear mean.
   Tensor sample(const Tensor& h, int sampling_steps, double temperature, torch::Generator& random);

@@ -94,6 +94,16 @@ Tensor CompleterNet::coarseLogits(const std::array<TokenSet, kTokenKinds>& input
   return coarse_occupancy->forward(tokens.slice(0, tokens.size(0) - targets));
 }
 
+void CompleterNet::coarseProbabilities(const SceneTokens& scene, const std::vector<Coord>& unknown,
+                                       const VoxelFrame& frame, std::map<Coord, float>* probability) {
+  for (const std::vector<Coord>& targets : chunksOf(unknown, config.coarse_chunk_tokens)) {
+    const Tensor p = config.coarse_stage
+                         ? coarseLogits(coarseInputs(scene, {}, targets, config.coarse_empty_tokens), frame).sigmoid().contiguous()
+                         : torch::ones({int64_t(targets.size())});
+    for (size_t i = 0; i < targets.size(); ++i) (*probability)[targets[i]] = p.data_ptr<float>()[i];
+  }
+}
+
 CompleterNet::Fine CompleterNet::fine(const std::array<TokenSet, kTokenKinds>& inputs,
                                       const VoxelFrame& frame) {
   const Tensor tokens = trunk->forward(inputs, 1, frame).tokens;
@@ -140,9 +150,8 @@ std::array<TokenSet, kTokenKinds> coarseInputs(const SceneTokens& scene,
   in[kCondition] = {coarseFeatures(scene.coarse_filled, scene.nodes), scene.coarse_filled};
   in[kVisible] = {{}, visible};
   // An even share of the empty shell: every k-th, so that it outlines the whole seen space.
-  const size_t stride = std::max<size_t>(1, (scene.coarse_empty.size() + size_t(empty_tokens) - 1) /
-                                                size_t(empty_tokens));
-  for (size_t i = 0; i < scene.coarse_empty.size(); i += stride)
+  const size_t most = size_t(empty_tokens), stride = most ? (scene.coarse_empty.size() + most - 1) / most : 0;
+  for (size_t i = 0; stride && i < scene.coarse_empty.size(); i += stride)
     in[kEmptyToken].coords.push_back(scene.coarse_empty[i]);
   in[kEmptyToken].features = coarseFeatures(in[kEmptyToken].coords, scene.nodes);
   in[kTarget] = {coarseFeatures(targets, scene.nodes), targets};
@@ -160,6 +169,24 @@ std::vector<int64_t> nearestRows(const std::vector<Coord>& coords, const Eigen::
   std::vector<int64_t> rows(n);
   for (size_t i = 0; i < n; ++i) rows[i] = by_distance[i].second;
   return rows;
+}
+
+std::vector<std::vector<Coord>> chunksOf(const std::vector<Coord>& tokens, int64_t size) {
+  const Tensor order = zOrder(tokens);
+  const int64_t n = int64_t(tokens.size()), count = (n + size - 1) / size;
+  std::vector<std::vector<Coord>> chunks(static_cast<size_t>(count));
+  for (int64_t c = 0; c < count; ++c)
+    for (int64_t i = c * n / count; i < (c + 1) * n / count; ++i)
+      chunks[size_t(c)].push_back(tokens[size_t(order.data_ptr<int64_t>()[i])]);
+  return chunks;
+}
+
+NodeStates statesIn(const NodeStates& s, const CoordBBox& voxels) {
+  NodeStates part;
+  part.level = s.level;
+  part.box = CoordBBox(tokenCoord(voxels.min(), s.level), tokenCoord(voxels.max(), s.level));
+  for (auto node = part.box.begin(); node; ++node) part.states.push_back(s.at(*node));
+  return part;
 }
 
 std::vector<Coord> unobservedChildren(const std::vector<Coord>& coarse, const NodeStates& nodes) {

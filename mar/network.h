@@ -1,6 +1,7 @@
 #pragma once
 // Private: the completer as torch modules, and how scenes become its inputs.
 #include <array>
+#include <map>
 
 #include "encoder/layers.h"
 #include "mar/completer.h"
@@ -44,11 +45,24 @@ struct MaskedTransformer : torch::nn::Module {
 constexpr int kCoarseFeatures = 24;
 Tensor coarseFeatures(const std::vector<Coord>& nodes, const NodeStates& children);
 
+/// What is known of a scene, as token lists of both levels.
+struct SceneTokens {
+  NodeStates nodes, coarse;               // levels 1 and 2
+  std::vector<Coord> empty_shell;         // level-1 E nodes with an unobserved neighbour
+  std::vector<Coord> coarse_filled;       // level-2 nodes with an F voxel
+  std::vector<Coord> coarse_empty;        // level-2 E nodes with an unobserved neighbour
+  std::vector<Coord> coarse_unknown;      // level-2 nodes with no F and some U voxel
+};
+SceneTokens sceneTokens(NodeStates nodes, NodeStates coarse);
+
 struct CompleterNet : torch::nn::Module {
   explicit CompleterNet(const CompleterConfig& config);
 
   /// Occupancy logits [targets] of coarse nodes.
   Tensor coarseLogits(const std::array<TokenSet, kTokenKinds>& inputs, const VoxelFrame& frame);
+  /// Their probabilities as inference asks for them, in chunks of neighbours; 1 without a coarse stage.
+  void coarseProbabilities(const SceneTokens& scene, const std::vector<Coord>& unknown, const VoxelFrame& frame,
+                           std::map<Coord, float>* probability);
   struct Fine {
     Tensor logits;      // [targets]
     Tensor targets;     // [targets, C] tokens for the diffusion head
@@ -59,7 +73,7 @@ struct CompleterNet : torch::nn::Module {
   /// Latents <-> unit deviation.
   Tensor standardise(const Tensor& z) { return (z - latent_mean) / latent_deviation; }
   /// Standardised predictions put back where latents lie: the encoder normalises each token's channel
-  /// groups, a mean does not. Without it growth drifts: each level is fed what the last one got wrong.
+  /// groups, a mean does not. Growth that sees what it made drifts without it; on its own a mean is the better colour.
   Tensor project(const Tensor& z) {
     return config.latent_groups ? standardise(torch::group_norm(restore(z), config.latent_groups)) : z;
   }
@@ -72,16 +86,6 @@ struct CompleterNet : torch::nn::Module {
   Tensor latent_mean, latent_deviation;  // [D] buffers, from the training latents
 };
 
-/// What is known of a scene, as token lists of both levels.
-struct SceneTokens {
-  NodeStates nodes, coarse;               // levels 1 and 2
-  std::vector<Coord> empty_shell;         // level-1 E nodes with an unobserved neighbour
-  std::vector<Coord> coarse_filled;       // level-2 nodes with an F voxel
-  std::vector<Coord> coarse_empty;        // level-2 E nodes with an unobserved neighbour
-  std::vector<Coord> coarse_unknown;      // level-2 nodes with no F and some U voxel
-};
-SceneTokens sceneTokens(NodeStates nodes, NodeStates coarse);
-
 /// Inputs of the coarse stage for some target positions.
 std::array<TokenSet, kTokenKinds> coarseInputs(const SceneTokens& scene,
                                                const std::vector<Coord>& visible,
@@ -90,6 +94,12 @@ std::array<TokenSet, kTokenKinds> coarseInputs(const SceneTokens& scene,
 /// The `count` of `coords` nearest to `centre`, by distance, ties by row: row indices.
 std::vector<int64_t> nearestRows(const std::vector<Coord>& coords, const Eigen::Vector3d& centre,
                                  int64_t count);
+
+/// Parts of at most `size`, about equal, of tokens that lie together.
+std::vector<std::vector<Coord>> chunksOf(const std::vector<Coord>& tokens, int64_t size);
+
+/// The states of the nodes in a box of voxels; unobserved where `states` has none.
+NodeStates statesIn(const NodeStates& states, const CoordBBox& voxels);
 
 /// Level-1 nodes of the given coarse nodes that were not observed.
 std::vector<Coord> unobservedChildren(const std::vector<Coord>& coarse, const NodeStates& nodes);

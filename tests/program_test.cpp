@@ -944,7 +944,7 @@ TEST_F(Program, EvalPrintsEveryMethodOnce) {
   NEEDS_WEIGHTS();
   const std::string folder = writeRoom("views", 3);
   const Ended ended = run({"eval", "--scenes", folder, "--views", "2", "--weights", VDBC_WEIGHTS,
-                           "--coarse-tau", "1", "--pictures", at("pictures"), "--json"});
+                           "--coarse-tau", "1", "--taus", ".2", "0.75", "--pictures", at("pictures"), "--json"});
   ASSERT_EQ(ended.code, kOk) << ended.err;
   std::map<std::string, int> scene, mean;
   for (const std::string& line : lines(ended.out)) {
@@ -962,7 +962,7 @@ TEST_F(Program, EvalPrintsEveryMethodOnce) {
     }
   }
   const std::map<std::string, int> once = {
-      {"box", 1}, {"completed", 1}, {"nearest", 1}, {"observed", 1}, {"pixel-aligned", 1}};
+      {"box", 1}, {"completed", 1}, {"completed-tau-0.2", 1}, {"completed-tau-0.75", 1}, {"nearest", 1}, {"observed", 1}, {"pixel-aligned", 1}};
   EXPECT_EQ(scene, once);
   EXPECT_EQ(mean, once);
   const Image sheet = readImage(at("pictures/0.png"));
@@ -1002,7 +1002,7 @@ TEST_F(Program, EvalReconstructNeedsOnlyTheEncoder) {
 
 TEST_F(Program, EvalReconstructRefusesOptionsOfTheCompletion) {
   const Args reconstruct = {"eval", "--scenes", "rooms:1", "--reconstruct"};
-  for (const Args& more : std::vector<Args>{{"--tau", ".1"}, {"--lpips", "x.pt"}, {"--refine-observed"},
+  for (const Args& more : std::vector<Args>{{"--tau", ".1"}, {"--taus", ".1"}, {"--random-order"}, {"--lpips", "x.pt"}, {"--refine-observed"},
                                             {"--optimise", "-1"}, {"--optimise", "nan"}}) {
     Args args = reconstruct;
     args.insert(args.end(), more.begin(), more.end());

@@ -82,12 +82,22 @@ inline void writeFile(const char* operation, const std::string& path, const void
 constexpr char kTrailerMagic[] = "vdbcsum1";
 constexpr size_t kTrailerBytes = sizeof(kTrailerMagic) - 1 + sizeof(uint64_t);
 
-/// The magic word and FNV-1a (64 bits, little-endian) of `bytes`.
+/// FNV-1a, 64 bits; `hash`: of the bytes before these.
+inline uint64_t fnv1a(const void* bytes, size_t size, uint64_t hash = 0xcbf29ce484222325u) {
+  for (size_t i = 0; i < size; ++i) hash = (hash ^ static_cast<const uint8_t*>(bytes)[i]) * 0x100000001b3u;
+  return hash;
+}
+
+/// 16 hexadecimal digits.
+inline std::string hexOf(uint64_t number) {
+  std::string text;
+  for (int shift = 60; shift >= 0; shift -= 4) text += "0123456789abcdef"[number >> shift & 15];
+  return text;
+}
+
+/// The magic word and fnv1a() of the bytes, little-endian.
 inline std::string checksumTrailer(const void* bytes, size_t size) {
-  uint64_t hash = 0xcbf29ce484222325u;
-  for (size_t i = 0; i < size; ++i) {
-    hash = (hash ^ static_cast<const uint8_t*>(bytes)[i]) * 0x100000001b3u;
-  }
+  const uint64_t hash = fnv1a(bytes, size);
   std::string trailer(kTrailerMagic);
   for (int byte = 0; byte < 8; ++byte) trailer.push_back(char(hash >> (8 * byte)));
   return trailer;

@@ -57,7 +57,7 @@ TokenMask readTokenMask(const std::string& path, const VoxelFrame& frame, int le
         const Coord node(nodes.min().x() + int(x), y, z);
         bool any = false;
         for (int v = 0; v < side * side * side && !any; ++v)
-          any = inside(Coord(node.x() * side + v / (side * side), y * side + v / side % side, z * side + v % side));
+          any = inside(voxelOf(node, side, v));
         if (any) rows[x].push_back(node);
       }
   });

@@ -55,13 +55,12 @@ class MemoryBuffer : public std::streambuf {
 void nameByContent(std::string* archive) {
   constexpr size_t kUuidAt = 21, kUuidBytes = 36;  // behind magic, three versions and a flag; ASCII
   archive->replace(kUuidAt, kUuidBytes, kUuidBytes, '0');
-  const std::string sum = checksumTrailer(archive->data(), archive->size());
+  const std::string sum = hexOf(fnv1a(archive->data(), archive->size()));
   std::string name;
   for (size_t i = 0; name.size() < kUuidBytes; ++i) {
     const bool dash = name.size() == 8 || name.size() == 13 || name.size() == 18 || name.size() == 23;
     if (dash) name += '-';
-    const auto byte = uint8_t(sum[sum.size() - 1 - i / 2 % 8]);
-    name += "0123456789abcdef"[i % 2 ? byte & 15 : byte >> 4];
+    name += sum[i % sum.size()];
   }
   archive->replace(kUuidAt, kUuidBytes, name);
 }
