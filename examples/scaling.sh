@@ -40,7 +40,7 @@ job() {
 }
 {
   for margin in .5 1 1.5 2 3 4 6 10; do job margin $margin "$root/examples/two_views" --margin $margin; done
-  bounds="-1.5 -11.5 -.5 12.5 1.5 3.2"
+  bounds="-1.5 -11.5 -0.5 12.5 1.5 3.2"
   last=2
   for rooms in 1 2 3 4 5 6 7 8; do
     # shellcheck disable=SC2086  # six numbers

@@ -5,7 +5,8 @@
 # have changed. One thread, well over an hour. The charts need gnuplot.
 #   sh examples/study.sh [FOLDER, default docs: writes completion.svg, tau.svg, results/completion.md, results/completion-*.jsonl]
 # ROOMS (1-16, with several tau), MORE_ROOMS (17-64) and HOMES (0-23, at two views) choose other scenes, VIEWS other numbers
-# of views. PARTS="rooms:1-16/2 ..." makes just those parts, so that several processes can share the work.
+# of views. PARTS="rooms:1-16/2 ..." makes just those parts, so that several processes can share the work; CHARTS_ONLY=1
+# makes none: charts and tables of what is there.
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
 folder=${1:-$root/docs}
@@ -81,10 +82,13 @@ if [ -n "${PARTS:-}" ]; then
   for p in $PARTS; do part "${p%/*}" "${p#*/}"; done
   exit
 fi
-for n in 2 $views; do part "$some" "$n"; part "$more" "$n"; done
-part "$all_homes" 2
+if [ -z "${CHARTS_ONLY:-}" ]; then
+  for n in 2 $views; do part "$some" "$n"; part "$more" "$n"; done
+  part "$all_homes" 2
+fi
 
-roomsOf() { echo "$(fileOf "$some" "$1") $(fileOf "$more" "$1")"; }
+# roomsOf VIEWS: the files there are.
+roomsOf() { for part in "$some" "$more"; do if [ -s "$(fileOf "$part" "$1")" ]; then fileOf "$part" "$1"; fi; done; }
 rooms=$(roomsOf 2)
 homes=$(fileOf "$all_homes" 2)
 # shellcheck disable=SC2086  # two files
@@ -96,7 +100,7 @@ homes=$(fileOf "$all_homes" 2)
   table "$homes"
   for n in $views; do
     # shellcheck disable=SC2046  # two files
-    [ "$n" = 2 ] || { printf '\nThe rooms, %s in:\n\n' "$n"; table $(roomsOf "$n"); }
+    [ "$n" = 2 ] || { printf '\n%s rooms, %s views in:\n\n' "$(scenes $(roomsOf "$n"))" "$n"; table $(roomsOf "$n"); }
   done
 } >"$data/completion.md"
 mv "$data/completion.md" "$results/completion.md"
@@ -143,23 +147,23 @@ plot x with lines lc "gray" dt 2 title "calibrated", "curve-rooms" with linespoi
   "curve-homes" with linespoints lw 1.5 pt 7 ps .5 lc 3 title "homes"
 PLOT
 gnuplot <<'PLOT'
-set terminal svg size 1350,380 font "sans,13" background "white"
+set terminal svg size 1350,400 font "sans,13" background "white"
 set output "tau.svg"
-set multiplot layout 1,4 margins .05,.98,.14,.86 spacing .06
+set multiplot layout 1,4 margins .05,.98,.16,.88 spacing .06
 scores = "psnr ssim flip f1"
 titles = "'PSNR [dB]' 'SSIM' 'FLIP (low is good)' 'Strict F1 of unseen nodes'"
 formats = "'%.2f' '%.3f' '%.3f' '%.3f'"
 set xlabel "views in"; set ylabel "tau"
 unset key; unset colorbox
-set xrange [-.5:4.5]; set yrange [.05:.65]
+set xrange [-.5:4.5]; set yrange [.05:.65]; set cbrange [0:1]; unset grid
 set xtics ("1" 0, "2" 1, "4" 2, "8" 3, "12" 4)
 place(n) = n > 8 ? 4 : n > 4 ? 3 : n > 2 ? 2 : n > 1 ? 1 : 0
 do for [s = 1:4] {
   set title word(titles, s)
   # Colours are per number of views: darkest the best tau of its column.
   if (s == 3) { set palette defined (0 "#6baed6", 1 "white") } else { set palette defined (0 "white", 1 "#6baed6") }
-  plot "< awk 'NR == FNR { if (!($1 in low) || $3 < low[$1]) low[$1] = $3; if (!($1 in high) || $3 > high[$1]) high[$1] = $3; next } { print $1, $2, $3, high[$1] > low[$1] ? ($3 - low[$1]) / (high[$1] - low[$1]) : 0 }' tau-".word(scores, s)." tau-".word(scores, s) \
-    using (place($1)):2:4 with image, "tau-".word(scores, s) using (place($1)):2:(sprintf(word(formats, s), $3)) with labels font ",11"
+  plot "< awk 'NR == FNR { if (!($1 in low) || $3 < low[$1]) low[$1] = $3; if (!($1 in high) || $3 > high[$1]) high[$1] = $3; next } { print $1, $2, $3, (high[$1] == low[$1] ? 0 : ($3 - low[$1]) / (high[$1] - low[$1])) }' tau-".word(scores, s)." tau-".word(scores, s) \
+    using (place($1)):2:(.5):(.05):4 with boxxyerror fs solid noborder lc palette, "tau-".word(scores, s) using (place($1)):2:(sprintf(word(formats, s), $3)) with labels font ",11"
 }
 PLOT
 mv completion.svg tau.svg "$results/.."

@@ -1459,5 +1459,25 @@ TEST_F(CompleterResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // A14
   EXPECT_THROW(trainCompleter(c, kOneColour, samples, 4, samples, 0, settings, nullptr, silent), Error);
 }
 
+TEST_F(CompleterResume, ATrainingCanStartFromGivenWeights) {
+  CompleterConfig c = toyConfig();
+  const SampleSource samples = [](uint64_t index) { return toySample(3 + int(index)); };
+  TrainSettings settings;
+  settings.steps = 2, settings.validate_every = settings.checkpoint_every = 2;
+  Progress silent;
+  const auto train = [&](const std::string& name) {
+    settings.weights_path = path(name + ".safetensors"), settings.work_folder = path(name);
+    trainCompleter(c, kOneColour, samples, 2, samples, 0, settings, nullptr, silent);
+    return readTensors(settings.weights_path).tensors;
+  };
+  const auto first = train("first");
+  // Other samples' latents, another seed and other settings: with a rate of 0 nothing of them shows.
+  settings.from = path("first.safetensors"), settings.learning_rate = 0, settings.seed = 2;
+  c.rotary_positions = false;
+  for (const auto& [name, tensor] : train("second")) EXPECT_TRUE(torch::equal(tensor, first.at(name))) << name;
+  c.width = 16;
+  EXPECT_THROW(train("third"), Error);
+}
+
 }  // namespace
 }  // namespace vdbc
