@@ -624,6 +624,7 @@ void cookTrainEncoder(const Train& t, const Common& common, Progress& progress) 
 void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
   constexpr int kValidationRooms = 8;
   const Encoder encoder(t.encoder);
+  if (!t.from.empty()) Completer{t.from};  // refused now, not after the rooms are encoded
   CompleterConfig config = configOf<CompleterConfig>(t);
   config.latent_dim = encoder.config().latent_dim, config.latent_groups = encoder.config().latent_groups;
   TrainSettings s = trainSettings(t, common);

@@ -237,8 +237,7 @@ struct Completer::Impl {
     }
     for (size_t kind = 0; kind < 2; ++kind)
       in[kind].features = g.z.index_select(0, torch::tensor(rows[kind], torch::kInt64));
-    for (int64_t row : nearestRows(scene.tokens.empty_shell, centre, net->config.empty_tokens))
-      in[kEmptyToken].coords.push_back(scene.tokens.empty_shell[size_t(row)]);
+    in[kEmptyToken].coords = nearestOf(scene.tokens.empty_shell, centre, net->config.empty_tokens);
     in[kTarget].coords = targets;
     std::vector<float> parent_probability;
     for (const Coord& c : targets) {
@@ -329,8 +328,7 @@ struct Completer::Impl {
         }
         in[kCondition] = {g->z.index_select(0, torch::tensor(rows)), tokens};
         in[kVisible].features = g->z.index_select(0, torch::tensor(near, torch::kInt64));
-        for (int64_t row : nearestRows(scene.tokens.empty_shell, centre, net->config.empty_tokens))
-          in[kEmptyToken].coords.push_back(scene.tokens.empty_shell[size_t(row)]);
+        in[kEmptyToken].coords = nearestOf(scene.tokens.empty_shell, centre, net->config.empty_tokens);
         in[kTarget].features = torch::zeros({0, 1});
         const CompleterNet::Fine f = net->fine(in, scene.windows[scene.windowOf(tokens[0])].frame);
         refined.index_copy_(0, torch::tensor(rows),

@@ -155,12 +155,6 @@ struct TargetRows {
   }
 };
 
-std::vector<Coord> nearestOf(const std::vector<Coord>& from, const Eigen::Vector3d& centre, int64_t n) {
-  std::vector<Coord> chosen;
-  for (int64_t row : nearestRows(from, centre, n)) chosen.push_back(from[size_t(row)]);
-  return chosen;
-}
-
 // The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities there.
 Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s, const VoxelFrame& frame,
                   torch::Generator& random, std::map<Coord, float>* gate) {

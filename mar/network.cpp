@@ -171,6 +171,12 @@ std::vector<int64_t> nearestRows(const std::vector<Coord>& coords, const Eigen::
   return rows;
 }
 
+std::vector<Coord> nearestOf(const std::vector<Coord>& coords, const Eigen::Vector3d& centre, int64_t count) {
+  std::vector<Coord> nearest;
+  for (int64_t row : nearestRows(coords, centre, count)) nearest.push_back(coords[size_t(row)]);
+  return nearest;
+}
+
 std::vector<std::vector<Coord>> chunksOf(const std::vector<Coord>& tokens, int64_t size) {
   const Tensor order = zOrder(tokens);
   const int64_t n = int64_t(tokens.size()), count = (n + size - 1) / size;

@@ -94,6 +94,8 @@ std::array<TokenSet, kTokenKinds> coarseInputs(const SceneTokens& scene,
 /// The `count` of `coords` nearest to `centre`, by distance, ties by row: row indices.
 std::vector<int64_t> nearestRows(const std::vector<Coord>& coords, const Eigen::Vector3d& centre,
                                  int64_t count);
+/// Their coordinates.
+std::vector<Coord> nearestOf(const std::vector<Coord>& coords, const Eigen::Vector3d& centre, int64_t count);
 
 /// Parts of at most `size`, about equal, of tokens that lie together.
 std::vector<std::vector<Coord>> chunksOf(const std::vector<Coord>& tokens, int64_t size);

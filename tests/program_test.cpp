@@ -1000,6 +1000,15 @@ TEST_F(Program, EvalReconstructNeedsOnlyTheEncoder) {
   EXPECT_EQ(sheet.height % 3, 0);  // two input views and the one other
 }
 
+TEST_F(Program, TrainingRefusesAStartThatIsNoCompleterBeforeAnyWork) {
+  NEEDS_WEIGHTS();
+  for (const std::string& from : {at("missing.safetensors"), std::string(VDBC_WEIGHTS "/encoder.safetensors")}) {
+    expectFailure({"train", "mar", "--encoder", VDBC_WEIGHTS "/encoder.safetensors", "--from", from, "-o",
+                   at("new.safetensors")}, kFailed, from);
+    EXPECT_FALSE(fs::exists(at("new.safetensors.work")));
+  }
+}
+
 TEST_F(Program, EvalReconstructRefusesOptionsOfTheCompletion) {
   const Args reconstruct = {"eval", "--scenes", "rooms:1", "--reconstruct"};
   for (const Args& more : std::vector<Args>{{"--tau", ".1"}, {"--taus", ".1"}, {"--random-order"}, {"--lpips", "x.pt"}, {"--refine-observed"},
