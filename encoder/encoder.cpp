@@ -51,8 +51,8 @@ EncoderConfig EncoderConfig::fromJson(const std::string& text, const std::string
     throw Error(joinText("EncoderConfig: ", where, ": bad configuration: ", e.what()));
   }
   auto within = [&](const char* name, int value, int low, int high) {
-    require(value >= low && value <= high, "EncoderConfig: ", where, ": expected ", name, " in [", low,
-            ", ", high, "], found ", value);
+    require(value >= low && value <= high, "EncoderConfig: ", where, ": expected ", name, " in [",
+            low, ", ", high, "], found ", value);
   };
   within("levels", c.levels, 0, 2), within("patches_across", c.patches_across, 1, 256);
   within("patch_px", c.patch_px, 1, 64), within("voxel_width", c.voxel_width, 1, 4096);
@@ -61,7 +61,8 @@ EncoderConfig EncoderConfig::fromJson(const std::string& text, const std::string
   within("window", c.window, 2, 1 << 16), within("latent_dim", c.latent_dim, 1, 1024);
   within("latent_groups", c.latent_groups, 0, c.latent_dim);
   within("gaussians_per_voxel", c.gaussians_per_voxel, 1, 512);
-  require(c.width % (2 * c.heads) == 0 && (c.latent_groups == 0 || c.latent_dim % c.latent_groups == 0) && c.voxel_m > 0,
+  require(c.width % (2 * c.heads) == 0 &&
+              (c.latent_groups == 0 || c.latent_dim % c.latent_groups == 0) && c.voxel_m > 0,
           "EncoderConfig: ", where, ": width, heads, groups or voxel size do not fit each other");
   return c;
 }
@@ -109,7 +110,9 @@ LatentGrid Encoder::encode(const std::vector<View>& views, const Observation& o,
   const EncoderConfig& c = config();
   // Rounded as files hold them: what is decoded or completed now is what a file would give.
   const Tensor z = impl_->net->normalise(impl_->net->encode(encoderInput(views, o, c)).mean)
-                       .to(torch::kHalf).to(torch::kFloat32).contiguous();
+                       .to(torch::kHalf)
+                       .to(torch::kFloat32)
+                       .contiguous();
   LatentGrid grid;
   grid.frame = o.frame, grid.level = c.levels, grid.dim = c.latent_dim;
   grid.ijk = o.tokens.coords(c.levels);
@@ -151,21 +154,22 @@ void copyToWorld(const GaussianTensors& t, const VoxelFrame& frame, size_t first
 
 }  // namespace
 
-DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen, float child_threshold,
-                            Progress& progress) const {
+DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen,
+                            float child_threshold, Progress& progress) const {
   torch::NoGradGuard no_grad;
   const EncoderConfig& c = config();
   require(latents.dim == c.latent_dim && latents.level == c.levels,
-          "Encoder::decode: the latent grid: expected ", c.latent_dim, " channels at level ", c.levels,
-          ", found ", latents.dim, " at level ", latents.level);
+          "Encoder::decode: the latent grid: expected ", c.latent_dim, " channels at level ",
+          c.levels, ", found ", latents.dim, " at level ", latents.level);
   DecodedGrid out;
   if (latents.size() == 0) {
     out.gaussians.resize(0, 0);
     return out;
   }
   std::vector<Coord> coords = latents.ijk;
-  DecoderTokens tokens = impl_->net->decodeTokens(
-      torch::tensor(latents.z).view({latents.size(), latents.dim}), coordTensor(coords), zOrder(coords));
+  DecoderTokens tokens =
+      impl_->net->decodeTokens(torch::tensor(latents.z).view({latents.size(), latents.dim}),
+                               coordTensor(coords), zOrder(coords));
   report(progress, -1);
 
   std::vector<int32_t> node(coords.size());
@@ -178,7 +182,8 @@ DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen
     const int side = 1 << (c.levels - 1 - split);  // of a child, in voxels
     auto activeBelow = [&](const auto& mask, const Coord& child) {
       int active = 0;
-      for (int v = 0; v < side * side * side; ++v) active += mask.isValueOn(voxelOf(child, side, v));
+      for (int v = 0; v < side * side * side; ++v)
+        active += mask.isValueOn(voxelOf(child, side, v));
       return active;
     };
     Children kept;
@@ -204,19 +209,22 @@ DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen
       }
       if (!any && likeliest >= 0) keep(likeliest, chance[int64_t(i)][likeliest]);
     }
-    tokens = impl_->net->splitTokens(tokens, {torch::tensor(kept.parent), torch::tensor(kept.slot)}, split);
+    tokens = impl_->net->splitTokens(tokens, {torch::tensor(kept.parent), torch::tensor(kept.slot)},
+                                     split);
     coords = std::move(kept.coords), node = std::move(kept.node);
     probability = std::move(kept.probability);
     report(progress, -1);
   }
-  // Some voxels at a time: with hundreds of Gaussians a voxel the last layer's output is many times the result.
+  // Some voxels at a time: with hundreds of Gaussians a voxel the last layer's output is many times
+  // the result.
   constexpr int64_t kChunk = 4096;
   const int64_t voxels = int64_t(coords.size()), m = c.gaussians_per_voxel;
   const Tensor all_coords = coordTensor(coords);
   out.gaussians.resize(voxels * m, 0);
   for (int64_t begin = 0; begin < voxels; begin += kChunk) {
     const int64_t end = std::min(voxels, begin + kChunk);
-    copyToWorld(impl_->net->gaussians(tokens.rows(begin, end), all_coords.slice(0, begin, end), latents.frame.voxel_m),
+    copyToWorld(impl_->net->gaussians(tokens.rows(begin, end), all_coords.slice(0, begin, end),
+                                      latents.frame.voxel_m),
                 latents.frame, size_t(begin * m), &out.gaussians);
     report(progress, int(100 * end / voxels));
   }

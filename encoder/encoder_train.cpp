@@ -29,12 +29,14 @@ struct Target {
   Tensor mask;    // [H, W, 1]
 };
 
-Target makeTarget(const View& view, const Observation& o, int levels, const CarveSettings& carving) {
+Target makeTarget(const View& view, const Observation& o, int levels,
+                  const CarveSettings& carving) {
   Target t;
   t.camera = view.camera;
   t.camera.world_from_camera = o.frame.world_from_grid.inverse() * view.camera.world_from_camera;
   t.colour = torch::tensor(view.colour.data).view({view.camera.height, view.camera.width, 3});
-  t.mask = torch::tensor(observedPixels(view, o, levels, carving)).to(torch::kFloat32)
+  t.mask = torch::tensor(observedPixels(view, o, levels, carving))
+               .to(torch::kFloat32)
                .view({view.camera.height, view.camera.width, 1});
   return t;
 }
@@ -45,7 +47,8 @@ Tensor renderTarget(const GaussianTensors& g, const Target& t) {
 }
 
 // Truth [N, 8] of the children of `coords` (tokens of `level`), and which of them are known at all.
-std::pair<Tensor, Tensor> childTruth(const std::vector<Coord>& coords, int level, const Observation& o) {
+std::pair<Tensor, Tensor> childTruth(const std::vector<Coord>& coords, int level,
+                                     const Observation& o) {
   const int64_t n = int64_t(coords.size());
   Tensor truth = torch::zeros({n, 8}, torch::kBool), known = torch::zeros({n, 8}, torch::kBool);
   bool* t = truth.data_ptr<bool>();
@@ -67,7 +70,8 @@ std::pair<Tensor, Tensor> childTruth(const std::vector<Coord>& coords, int level
 // Decodes with the training mask (truth and false positives) or, without a generator, with the
 // network's own splits, kept where observed (as Encoder::decode does).
 GaussianTensors decodeForTraining(EncoderNet& net, const Tensor& z, const EncoderInput& in,
-                                  const Observation& o, torch::Generator* random, Tensor* occupancy) {
+                                  const Observation& o, torch::Generator* random,
+                                  Tensor* occupancy) {
   const EncoderConfig& c = net.config;
   std::vector<Coord> coords = o.tokens.coords(c.levels);
   DecoderTokens tokens = net.decodeTokens(z, in.coords, in.order);
@@ -76,9 +80,9 @@ GaussianTensors decodeForTraining(EncoderNet& net, const Tensor& z, const Encode
     const auto [truth, known] = childTruth(coords, level, o);
     const Tensor logits = net.childLogits(tokens, split);
     if (occupancy && known.any().item<bool>())
-      *occupancy = *occupancy + torch::binary_cross_entropy_with_logits(
-                                    logits.masked_select(known),
-                                    truth.masked_select(known).to(torch::kFloat32));
+      *occupancy = *occupancy +
+                   torch::binary_cross_entropy_with_logits(
+                       logits.masked_select(known), truth.masked_select(known).to(torch::kFloat32));
     const Tensor mask = random ? injectFalsePositives(truth, coords, c.false_positives, *random)
                                : truth | ((logits > 0) & ~known);
     const Split s = splitOf(mask);
@@ -104,8 +108,8 @@ Observation observeForTraining(const std::vector<View>& views, const EncoderConf
   return observe(views, fitVolume(depth, volume, settings.carving), settings, silent);
 }
 
-Losses sceneLosses(EncoderNet& net, const std::vector<View>& condition, const std::vector<View>& targets,
-                   torch::Generator& random) {
+Losses sceneLosses(EncoderNet& net, const std::vector<View>& condition,
+                   const std::vector<View>& targets, torch::Generator& random) {
   const EncoderConfig& c = net.config;
   const Observation o = observeForTraining(condition, c);
   const EncoderInput in = encoderInput(condition, o, c);
@@ -113,7 +117,9 @@ Losses sceneLosses(EncoderNet& net, const std::vector<View>& condition, const st
   const Tensor noise = torch::randn(posterior.mean.sizes(), random);
   const Tensor z = net.normalise(posterior.mean + (posterior.log_variance / 2).exp() * noise);
   Losses l;
-  l.kl = .5f * (posterior.mean.square() + posterior.log_variance.exp() - 1 - posterior.log_variance).mean();
+  l.kl =
+      .5f *
+      (posterior.mean.square() + posterior.log_variance.exp() - 1 - posterior.log_variance).mean();
   l.occupancy = torch::zeros({});
   const GaussianTensors g = decodeForTraining(net, z, in, o, &random, &l.occupancy);
   Tensor error = torch::zeros({}), pixels = torch::zeros({});
@@ -187,16 +193,20 @@ Validation validate(EncoderNet& net, const std::vector<std::vector<View>>& scene
 }  // namespace
 
 void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_t scene_count,
-                  const SceneSource& validation, int validation_count, const TrainSettings& settings,
-                  const TrainListener& listener, Progress& progress) {
+                  const SceneSource& validation, int validation_count,
+                  const TrainSettings& settings, const TrainListener& listener,
+                  Progress& progress) {
   torch::manual_seed(settings.seed);
   auto net = std::make_shared<EncoderNet>(config), average = std::make_shared<EncoderNet>(config);
   Trainer trainer(net, average, "encoder", config.toJson(), settings, listener);
   std::vector<std::vector<View>> held_out;
-  for (int i = 0; i < validation_count; ++i) held_out.push_back(viewsOf(validation, uint64_t(i), 4));
+  for (int i = 0; i < validation_count; ++i)
+    held_out.push_back(viewsOf(validation, uint64_t(i), 4));
 
-  // The scenes of a round of kStepsPerScene steps, one for each of this process's samples in a step.
-  auto scenesOfRound = [&, first = trainer.firstSample() - trainer.step() * settings.batch](int64_t round) {
+  // The scenes of a round of kStepsPerScene steps, one for each of this process's samples in a
+  // step.
+  auto scenesOfRound = [&, first = trainer.firstSample() -
+                                   trainer.step() * settings.batch](int64_t round) {
     std::vector<std::vector<View>> all;
     for (int64_t k = first; k < first + trainer.samples(); ++k)
       all.push_back(viewsOf(scenes, uint64_t((round * settings.batch + k) % scene_count), 3));
@@ -206,12 +216,13 @@ void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_
   std::future<std::vector<std::vector<View>>> next;
   progress.start("train encoder");
   while (!trainer.done()) {
-    if (!next.valid()) next = std::async(std::launch::async, scenesOfRound, trainer.step() / kStepsPerScene + 1);
+    if (!next.valid())
+      next = std::async(std::launch::async, scenesOfRound, trainer.step() / kStepsPerScene + 1);
     for (int64_t k = 0; k < trainer.samples(); ++k) {
       const std::vector<View>& views = current[size_t(k)];
       // A generator per sample: a resumed run draws what an uninterrupted one would have drawn.
-      torch::Generator random =
-          at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(trainer.firstSample() + k));
+      torch::Generator random = at::detail::createCPUGenerator(settings.seed * 1000003 +
+                                                               uint64_t(trainer.firstSample() + k));
       const std::vector<size_t> order = shuffledIndices(views.size(), random);
       const size_t n = std::min(views.size() - 2, size_t(1) << randomInt(4, random));  // 1, 2, 4, 8
       std::vector<View> condition, targets;
@@ -221,8 +232,10 @@ void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_
       const MixedPrecision mixed(settings.mixed_precision);
       const Losses l = sceneLosses(*net, condition, targets, random);
       const Tensor total = l.total(config);
-      trainer.addSample(total, {{"loss", total.item<double>()}, {"image", l.image.item<double>()},
-                                {"kl", l.kl.item<double>()}, {"split", l.occupancy.item<double>()}});
+      trainer.addSample(total, {{"loss", total.item<double>()},
+                                {"image", l.image.item<double>()},
+                                {"kl", l.kl.item<double>()},
+                                {"split", l.occupancy.item<double>()}});
     }
     trainer.update();
     if (trainer.step() % kStepsPerScene == 0) current = next.get();
@@ -236,8 +249,8 @@ void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_
   progress.end();
 }
 
-std::pair<double, double> encoderStepLoss(const EncoderConfig& config, const std::vector<View>& views,
-                                          uint64_t seed) {
+std::pair<double, double> encoderStepLoss(const EncoderConfig& config,
+                                          const std::vector<View>& views, uint64_t seed) {
   torch::manual_seed(seed);
   auto net = std::make_shared<EncoderNet>(config);
   torch::optim::AdamW optimiser(net->parameters(), torch::optim::AdamWOptions(1e-4));

@@ -48,7 +48,8 @@ Rotary rotary(const Tensor& coords, int head_dim) {
   const int64_t n = coords.size(0), pairs = head_dim / 2;
   const int used = int(std::min<int64_t>(kFrequencies, pairs / 3));
   std::vector<float> f(size_t(used), 1.5f);
-  for (int i = 1; i < used; ++i) f[size_t(i)] = 1.5f * std::pow(.094f / 1.5f, float(i) / float(used - 1));
+  for (int i = 1; i < used; ++i)
+    f[size_t(i)] = 1.5f * std::pow(.094f / 1.5f, float(i) / float(used - 1));
   const Tensor frequencies = torch::tensor(f);
   Tensor angle = coords.to(torch::kFloat32).unsqueeze(2) * frequencies;  // [N, 3, used]
   angle = torch::cat({angle.reshape({n, 3 * used}), torch::zeros({n, pairs - 3 * used})}, 1);
@@ -57,7 +58,8 @@ Rotary rotary(const Tensor& coords, int head_dim) {
 
 Tensor rotate(const Tensor& x, const Rotary& p) {
   const auto halves = x.chunk(2, -1);
-  return torch::cat({halves[0] * p.cos - halves[1] * p.sin, halves[0] * p.sin + halves[1] * p.cos}, -1);
+  return torch::cat({halves[0] * p.cos - halves[1] * p.sin, halves[0] * p.sin + halves[1] * p.cos},
+                    -1);
 }
 
 Tensor sinusoidalCode(const Tensor& positions) {
@@ -67,7 +69,8 @@ Tensor sinusoidalCode(const Tensor& positions) {
 }
 
 Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame) {
-  constexpr float kExtent = 12.8f;  // metres; larger places go beyond +-.5 and the code still differs
+  constexpr float kExtent =
+      12.8f;  // metres; larger places go beyond +-.5 and the code still differs
   const Coord lo = frame.bounds.min(), hi = frame.bounds.max();
   const Tensor origin = torch::tensor({float(lo.x() + hi.x() + 1) / 2 * frame.voxel_m,
                                        float(lo.y() + hi.y() + 1) / 2 * frame.voxel_m,
@@ -107,7 +110,8 @@ Tensor splitHeads(const Tensor& x, int heads) {  // [N, C] -> [H, N, C / H]
 
 Tensor Attention::attend(const Tensor& q_rows, const Tensor& k_rows, const Tensor& v_rows,
                          const Rotary* q_pos, const Rotary* k_pos) const {
-  Tensor q = splitHeads(q_rows, heads), k = splitHeads(k_rows, heads), v = splitHeads(v_rows, heads);
+  Tensor q = splitHeads(q_rows, heads), k = splitHeads(k_rows, heads),
+         v = splitHeads(v_rows, heads);
   if (q_pos) q = rotate(q, *q_pos);
   if (k_pos) k = rotate(k, *k_pos);
   const double scale = 1 / std::sqrt(double(q.size(2)));
@@ -117,22 +121,24 @@ Tensor Attention::attend(const Tensor& q_rows, const Tensor& k_rows, const Tenso
 
 Tensor Attention::forward(const Tensor& x, const Tensor& context, const Rotary* x_pos,
                           const Rotary* context_pos) {
-  return output->forward(
-      attend(query->forward(x), key->forward(context), value->forward(context), x_pos, context_pos));
+  return output->forward(attend(query->forward(x), key->forward(context), value->forward(context),
+                                x_pos, context_pos));
 }
 
 Tensor Attention::windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,
                            bool shifted) {
   const int64_t n = x.size(0), width = x.size(1);
   if (n <= window) return forward(x, x, pos, pos);
-  // Rows in curve order; a shifted layer starts half a window earlier, so its first and last windows
-  // are half empty. Places without a token are masked.
+  // Rows in curve order; a shifted layer starts half a window earlier, so its first and last
+  // windows are half empty. Places without a token are masked.
   const int64_t lead = shifted ? window / 2 : 0;
   const int64_t windows = (n + lead + window - 1) / window;
   const int64_t tail = windows * window - lead - n;
   auto toWindows = [&](const Tensor& rows) {  // [N, C] -> [windows * H, window, C / H]
     const Tensor padded = torch::constant_pad_nd(rows, {0, 0, lead, tail});
-    return padded.view({windows, window, heads, -1}).transpose(1, 2).reshape({windows * heads, window, -1});
+    return padded.view({windows, window, heads, -1})
+        .transpose(1, 2)
+        .reshape({windows * heads, window, -1});
   };
   const Tensor sorted = x.index_select(0, order);
   auto headed = [&](const Tensor& rows) {
@@ -149,7 +155,9 @@ Tensor Attention::windowed(const Tensor& x, const Rotary* pos, const Tensor& ord
   const double scale = 1 / std::sqrt(double(q.size(2)));
   Tensor a = torch::matmul(q * scale, k.transpose(1, 2)).view({windows, heads, window, window});
   a = (a + blocked).softmax(-1).view({windows * heads, window, window});
-  const Tensor out = torch::matmul(a, v).view({windows, heads, window, -1}).transpose(1, 2)
+  const Tensor out = torch::matmul(a, v)
+                         .view({windows, heads, window, -1})
+                         .transpose(1, 2)
                          .reshape({windows * window, width})
                          .slice(0, lead, lead + n);
   Tensor inverse = torch::empty_like(order);
@@ -169,7 +177,8 @@ SelfBlock::SelfBlock(int width, int heads) {
   mlp = register_module("mlp", std::make_shared<Mlp>(width, 4 * width, width));
 }
 
-Tensor SelfBlock::forward(Tensor x, const Rotary* pos, const Tensor& order, int window, bool shifted) {
+Tensor SelfBlock::forward(Tensor x, const Rotary* pos, const Tensor& order, int window,
+                          bool shifted) {
   x = x + attention->windowed(norm1->forward(x), pos, order, window, shifted);
   return x + mlp->forward(norm2->forward(x));
 }
@@ -184,14 +193,16 @@ void initialiseXavier(nn::Module& module) {
     }
 }
 
-void updateAverage(std::vector<Tensor>& average, const std::vector<Tensor>& parameters, double decay) {
+void updateAverage(std::vector<Tensor>& average, const std::vector<Tensor>& parameters,
+                   double decay) {
   torch::NoGradGuard no_grad;
   for (size_t i = 0; i < average.size(); ++i) average[i].lerp_(parameters[i], 1 - decay);
 }
 
 double cosineRate(double base, int64_t step, int64_t steps, int64_t warmup, double floor) {
   if (step < warmup) return base * double(step + 1) / double(warmup);
-  const double t = std::min(1.0, double(step - warmup) / double(std::max<int64_t>(1, steps - warmup)));
+  const double t =
+      std::min(1.0, double(step - warmup) / double(std::max<int64_t>(1, steps - warmup)));
   return base * (floor + (1 - floor) * .5 * (1 + std::cos(M_PI * t)));
 }
 

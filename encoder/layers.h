@@ -45,8 +45,8 @@ Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame);
 /// The same of the centres of tokens [N, 3] int32 of a tree level.
 Tensor tokenPositions(const Tensor& coords, int level, const VoxelFrame& frame);
 
-/// While it lives, this thread's Linear layers multiply in bfloat16, forward and backward; all else, the
-/// parameters too, stays float32.
+/// While it lives, this thread's Linear layers multiply in bfloat16, forward and backward; all
+/// else, the parameters too, stays float32.
 class MixedPrecision {
  public:
   explicit MixedPrecision(bool on);
@@ -72,14 +72,16 @@ struct Attention : torch::nn::Module {
                  const Rotary* context_pos = nullptr);
   /// Self-attention of [N, C] within windows of `window` tokens consecutive in `order` (Z-order),
   /// every second layer shifted by half a window. Full attention where N <= window.
-  Tensor windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window, bool shifted);
-  /// alpha * attention + (1 - alpha) * guide, mixed before the output projection; `guide` maps values
-  /// [M, C] to [N, C] (spec E7).
+  Tensor windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,
+                  bool shifted);
+  /// alpha * attention + (1 - alpha) * guide, mixed before the output projection; `guide` maps
+  /// values [M, C] to [N, C] (spec E7).
   template <typename Guide>
   Tensor guided(const Tensor& x, const Tensor& context, const Tensor& alpha, const Guide& guide) {
     const Tensor v = value->forward(context);
-    return output->forward(alpha * attend(query->forward(x), key->forward(context), v, nullptr, nullptr) +
-                           (1 - alpha) * guide(v));
+    return output->forward(
+        alpha * attend(query->forward(x), key->forward(context), v, nullptr, nullptr) +
+        (1 - alpha) * guide(v));
   }
 
   int heads;
@@ -106,11 +108,13 @@ struct SelfBlock : torch::nn::Module {
   std::shared_ptr<Mlp> mlp;
 };
 
-/// Xavier for matrices, zeros for biases (spec E13); modules that must start at zero do so afterwards.
+/// Xavier for matrices, zeros for biases (spec E13); modules that must start at zero do so
+/// afterwards.
 void initialiseXavier(torch::nn::Module& module);
 
 /// Exponential moving average of parameters: average += (1 - decay) * (value - average).
-void updateAverage(std::vector<Tensor>& average, const std::vector<Tensor>& parameters, double decay);
+void updateAverage(std::vector<Tensor>& average, const std::vector<Tensor>& parameters,
+                   double decay);
 
 /// base * (linear warm-up, then cosine from 1 to `floor`). Spec E13, A14.
 double cosineRate(double base, int64_t step, int64_t steps, int64_t warmup, double floor);

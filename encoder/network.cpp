@@ -19,8 +19,11 @@ CountAttention countAttention(const std::vector<int32_t>& rows, const std::vecto
                               bool log_counts) {
   std::vector<double> top(size_t(n), 0.0), sum(size_t(n), 0.0);
   std::vector<int64_t> entries(size_t(n), 0);
-  auto logit = [&](size_t k) { return log_counts ? std::log1p(double(counts[k])) : double(counts[k]); };
-  for (size_t k = 0; k < rows.size(); ++k) top[size_t(rows[k])] = std::max(top[size_t(rows[k])], logit(k));
+  auto logit = [&](size_t k) {
+    return log_counts ? std::log1p(double(counts[k])) : double(counts[k]);
+  };
+  for (size_t k = 0; k < rows.size(); ++k)
+    top[size_t(rows[k])] = std::max(top[size_t(rows[k])], logit(k));
   for (size_t k = 0; k < rows.size(); ++k) {
     sum[size_t(rows[k])] += std::exp(logit(k) - top[size_t(rows[k])]);
     ++entries[size_t(rows[k])];
@@ -53,19 +56,23 @@ Tensor patchPixels(const std::vector<View>& views, const Observation& o, int px)
   for (size_t i = 0; i < views.size(); ++i) {
     const PatchLattice& l = o.lattices[i];
     const Image image = resizeImage(views[i].colour, l.columns * px, l.rows * px);
-    const Tensor t = torch::from_blob(const_cast<float*>(image.data.data()), {l.rows, px, l.columns, px, 3});
-    all.push_back((t.permute({0, 2, 1, 3, 4}).reshape({l.rows * l.columns, px * px * 3}) - .5f) * 4);
+    const Tensor t =
+        torch::from_blob(const_cast<float*>(image.data.data()), {l.rows, px, l.columns, px, 3});
+    all.push_back((t.permute({0, 2, 1, 3, 4}).reshape({l.rows * l.columns, px * px * 3}) - .5f) *
+                  4);
   }
   return torch::cat(all);
 }
 
-// Where each patch looks from and to: centre ray 3, camera place 3 and mean point 3 (normalised), share 1.
+// Where each patch looks from and to: centre ray 3, camera place 3 and mean point 3 (normalised),
+// share 1.
 Tensor patchGeometry(const std::vector<View>& views, const Observation& o) {
   std::vector<float> rays;
   for (size_t i = 0; i < views.size(); ++i) {
     const PatchLattice& l = o.lattices[i];
     const Camera& c = views[i].camera;
-    const Eigen::Isometry3d grid_from_camera = o.frame.world_from_grid.inverse() * c.world_from_camera;
+    const Eigen::Isometry3d grid_from_camera =
+        o.frame.world_from_grid.inverse() * c.world_from_camera;
     for (int y = 0; y < l.rows; ++y)
       for (int x = 0; x < l.columns; ++x) {
         const double u = (x + .5) * c.width / l.columns, v = (y + .5) * c.height / l.rows;
@@ -81,7 +88,8 @@ Tensor patchGeometry(const std::vector<View>& views, const Observation& o) {
   const Tensor share = points.slice(1, 3, 4);
   const Tensor seen = (share > 0).to(torch::kFloat32);
   return torch::cat({r.slice(1, 0, 3), normalisedPositions(r.slice(1, 3, 6), o.frame),
-                     normalisedPositions(points.slice(1, 0, 3), o.frame) * seen, share}, 1);
+                     normalisedPositions(points.slice(1, 0, 3), o.frame) * seen, share},
+                    1);
 }
 
 }  // namespace
@@ -150,10 +158,11 @@ void BidirectionalBlock::forward(Tensor* x3, Tensor* x2, const EncoderInput& in,
 EncoderNet::EncoderNet(const EncoderConfig& c) : config(c) {
   const int64_t d = c.width, dv = c.voxel_width, m = c.gaussians_per_voxel;
   auto norm = [&](int64_t width) { return nn::LayerNorm(nn::LayerNormOptions({width})); };
-  voxel_in = register_module("voxel_in", std::make_shared<Mlp>(kVoxelFeatures, 2 * dv, c.levels ? dv : d));
+  voxel_in =
+      register_module("voxel_in", std::make_shared<Mlp>(kVoxelFeatures, 2 * dv, c.levels ? dv : d));
   for (int l = 1; l <= c.levels; ++l)
-    aggregate.push_back(register_module(
-        "aggregate" + std::to_string(l), std::make_shared<Mlp>(8 * (l == 1 ? dv : d), 2 * d, d)));
+    aggregate.push_back(register_module("aggregate" + std::to_string(l),
+                                        std::make_shared<Mlp>(8 * (l == 1 ? dv : d), 2 * d, d)));
   position_in = register_module("position_in", Linear(kSinusoidalDim, d));
   patch_in = register_module("patch_in", Linear(3 * c.patch_px * c.patch_px, d));
   geometry_in = register_module("geometry_in", Linear(10 + 2 * kSinusoidalDim, d));
@@ -183,18 +192,21 @@ EncoderNet::EncoderNet(const EncoderConfig& c) : config(c) {
   torch::NoGradGuard no_grad;
   posterior->bias.slice(0, c.latent_dim).fill_(-4);  // starts nearly deterministic
   gaussian_out->weight.mul_(.3);
-  // One colour a token at first; the octants learn to differ (starting apart costs .2 dB after 400 steps).
+  // One colour a token at first; the octants learn to differ (starting apart costs .2 dB after 400
+  // steps).
   colour_shortcut->weight.copy_(colour_shortcut->weight.slice(0, 0, 3).repeat({8, 1}));
   feature_shortcut->weight.slice(1, kVoxelFeatures).zero_();
 }
 
 namespace {
 
-// Colours [..., 3] around 0 as luminance and two differences, scaled to about unit deviation: hues differ by
-// hundredths, and a network that sees them beside brightness learns grey first and colour much later.
+// Colours [..., 3] around 0 as luminance and two differences, scaled to about unit deviation: hues
+// differ by hundredths, and a network that sees them beside brightness learns grey first and colour
+// much later.
 Tensor opponentColours(const Tensor& srgb) {
   const Tensor y = srgb.mean(-1, true);
-  return torch::cat({(y - .5f) * 4, (srgb.slice(-1, 0, 1) - y) * 12, (srgb.slice(-1, 2, 3) - y) * 12}, -1);
+  return torch::cat(
+      {(y - .5f) * 4, (srgb.slice(-1, 0, 1) - y) * 12, (srgb.slice(-1, 2, 3) - y) * 12}, -1);
 }
 // The reverse for the network's outputs: display colour less .5.
 Tensor srgbFromOpponent(const Tensor& o) {
@@ -207,7 +219,8 @@ Tensor scaledFeatures(const Tensor& f) {
   const Tensor octants = f.slice(1, 0, 32).view({-1, 8, 4}), share = octants.slice(2, 3, 4);
   const Tensor colours = opponentColours(octants.slice(2, 0, 3)) * (share > 0);
   return torch::cat({torch::cat({colours, share * 4}, 2).view({-1, 32}),
-                     opponentColours(f.slice(1, 32, 35)), f.slice(1, 35, kVoxelFeatures) * 2}, 1);
+                     opponentColours(f.slice(1, 32, 35)), f.slice(1, 35, kVoxelFeatures) * 2},
+                    1);
 }
 
 }  // namespace
@@ -220,7 +233,8 @@ EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
     const Tensor& children = in.children[l];
     auto gather = [&](const Tensor& rows) {  // [N, 8, C], absent children 0
       return torch::cat({rows, torch::zeros({1, rows.size(1)})})
-          .index_select(0, children.flatten()).view({children.size(0), 8, rows.size(1)});
+          .index_select(0, children.flatten())
+          .view({children.size(0), 8, rows.size(1)});
     };
     const Tensor present = (children < x3.size(0)).sum(1, true).to(torch::kFloat32);
     octants = gather(pooled.slice(1, 32, 35));
@@ -229,9 +243,10 @@ EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
   }
   x3 = x3 + position_in->forward(sinusoidalCode(in.positions));
   Tensor x2 = patch_in->forward(in.patches) +
-              geometry_in->forward(torch::cat({in.patch_geometry,
-                                               sinusoidalCode(in.patch_geometry.slice(1, 3, 6)),
-                                               sinusoidalCode(in.patch_geometry.slice(1, 6, 9))}, 1));
+              geometry_in->forward(
+                  torch::cat({in.patch_geometry, sinusoidalCode(in.patch_geometry.slice(1, 3, 6)),
+                              sinusoidalCode(in.patch_geometry.slice(1, 6, 9))},
+                             1));
   const Rotary pos = rotary(in.coords, config.width / config.heads);
   for (size_t b = 0; b < blocks.size(); ++b) blocks[b]->forward(&x3, &x2, in, pos, int(b));
   const auto halves = posterior->forward(posterior_norm->forward(x3)).chunk(2, 1);
@@ -257,7 +272,8 @@ Tensor EncoderNet::childLogits(const DecoderTokens& tokens, int split) {
 
 DecoderTokens EncoderNet::splitTokens(const DecoderTokens& tokens, const Split& s, int split) {
   const Tensor rows = s.parent * 8 + s.slot;
-  const Tensor features = child_tokens[size_t(split)]->forward(tokens.features).view({tokens.features.size(0) * 8, -1});
+  const Tensor features =
+      child_tokens[size_t(split)]->forward(tokens.features).view({tokens.features.size(0) * 8, -1});
   const Tensor colours = tokens.colours.reshape({-1, 1, 3}).index_select(0, rows);
   return {features.index_select(0, rows), colours.expand({-1, 8, 3})};
 }
@@ -266,7 +282,11 @@ Tensor subLattice(int64_t m) {
   const int64_t side = int64_t(std::ceil(std::cbrt(double(m)) - 1e-9)), cells = side * side * side;
   const Tensor cell = torch::arange(m) * cells / m;
   const auto at = [&](int64_t stride) {
-    return (torch::floor_divide(cell.to(torch::kInt64), stride).remainder(side).to(torch::kFloat32) + .5f) / float(side);
+    return (torch::floor_divide(cell.to(torch::kInt64), stride)
+                .remainder(side)
+                .to(torch::kFloat32) +
+            .5f) /
+           float(side);
   };
   return torch::stack({at(side * side), at(side), at(1)}, 1);
 }
@@ -279,14 +299,18 @@ GaussianTensors EncoderNet::gaussians(const DecoderTokens& voxels, const Tensor&
   const Tensor octant = high.select(1, 0) * 4 + high.select(1, 1) * 2 + high.select(1, 2);
   const Tensor colour = x.slice(2, 11, 14) + voxels.colours.index_select(1, octant);
   const Tensor corner = coords.to(torch::kFloat32).unsqueeze(1);
-  // Biases at the start: sigma of half a sub-cell, opacity .73, unit rotation, grey. Offsets reach .75 voxel.
+  // Biases at the start: sigma of half a sub-cell, opacity .73, unit rotation, grey. Offsets reach
+  // .75 voxel.
   const float sigma0 = .5f / float(std::cbrt(double(m))), raw0 = std::log(std::expm1(sigma0));
   GaussianTensors g;
-  g.mean = ((corner + lattice.unsqueeze(0) + .75f * torch::tanh(x.slice(2, 0, 3))) * h).view({n * m, 3});
-  g.log_scale = torch::log(torch::softplus(x.slice(2, 3, 6) + raw0).clamp(.02, 1.5) * h).view({n * m, 3});
+  g.mean =
+      ((corner + lattice.unsqueeze(0) + .75f * torch::tanh(x.slice(2, 0, 3))) * h).view({n * m, 3});
+  g.log_scale =
+      torch::log(torch::softplus(x.slice(2, 3, 6) + raw0).clamp(.02, 1.5) * h).view({n * m, 3});
   g.rotation = (x.slice(2, 6, 10) + torch::tensor({1.f, 0.f, 0.f, 0.f})).view({n * m, 4});
   g.opacity_logit = (x.slice(2, 10, 11) + 1).view({n * m});
-  // Rasterisers cut colours off at 0, where no gradient passes: a channel that fell below stayed dark for good.
+  // Rasterisers cut colours off at 0, where no gradient passes: a channel that fell below stayed
+  // dark for good.
   const Tensor srgb = srgbFromOpponent(colour) + .5f;
   g.sh = ((srgb + (srgb.clamp_min(1e-3) - srgb).detach() - .5f) / kSh0).view({n * m, 1, 3});
   return g;
@@ -317,7 +341,8 @@ Tensor injectFalsePositives(const Tensor& occupied, const std::vector<Coord>& co
   Tensor flat = mask.view({-1});
   auto addRandom = [&](const std::vector<int64_t>& pool, int64_t count) {
     const Tensor candidates = torch::tensor(pool);
-    const Tensor open = candidates.index_select(0, (~flat.index_select(0, candidates)).nonzero().flatten());
+    const Tensor open =
+        candidates.index_select(0, (~flat.index_select(0, candidates)).nonzero().flatten());
     const Tensor order = torch::randperm(open.size(0), random);
     flat.index_fill_(0, open.index_select(0, order.slice(0, 0, count)), true);
   };

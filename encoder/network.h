@@ -16,17 +16,19 @@ struct CountAttention {
 
 /// From (row, column, count) triples of an N x M matrix that is zero elsewhere.
 CountAttention countAttention(const std::vector<int32_t>& rows, const std::vector<int32_t>& columns,
-                              const std::vector<float>& counts, int64_t n, int64_t m, bool log_counts);
+                              const std::vector<float>& counts, int64_t n, int64_t m,
+                              bool log_counts);
 
 /// An observation as tensors.
 struct EncoderInput {
-  Tensor voxel_features;          // [N0, kVoxelFeatures]
-  std::vector<Tensor> children;   // per level 1..levels: [N_l, 8] int64 rows below, N_(l-1) where absent
-  Tensor coords;                  // [N, 3] int32 of the latent level
-  Tensor positions;               // [N, 3] normalised
-  Tensor order;                   // Z-order of the latent level
-  Tensor patches;                 // [P, 3 * px * px]
-  Tensor patch_geometry;          // [P, 10]: centre ray, camera place, mean point (normalised), share
+  Tensor voxel_features;  // [N0, kVoxelFeatures]
+  std::vector<Tensor>
+      children;           // per level 1..levels: [N_l, 8] int64 rows below, N_(l-1) where absent
+  Tensor coords;          // [N, 3] int32 of the latent level
+  Tensor positions;       // [N, 3] normalised
+  Tensor order;           // Z-order of the latent level
+  Tensor patches;         // [P, 3 * px * px]
+  Tensor patch_geometry;  // [P, 10]: centre ray, camera place, mean point (normalised), share
   CountAttention voxels_from_patches, patches_from_voxels;
 };
 EncoderInput encoderInput(const std::vector<View>& views, const Observation& observation,
@@ -53,8 +55,8 @@ struct Split {
   Tensor slot;    // [V] int64, 0-7
 };
 
-/// What the decoder knows of N tokens: features of its transformer and, around them, the colours that the
-/// Gaussians in each of a token's 8 octants start from (opponent colours).
+/// What the decoder knows of N tokens: features of its transformer and, around them, the colours
+/// that the Gaussians in each of a token's 8 octants start from (opponent colours).
 struct DecoderTokens {
   Tensor features;  // [N, C]
   Tensor colours;   // [N, 8, 3]
@@ -63,8 +65,9 @@ struct DecoderTokens {
   }
 };
 
-/// Places of M Gaussians in a unit voxel, [M, 3]: centres of the smallest cubic lattice with at least M
-/// cells, every cell where M is a cube and evenly spread ones elsewhere; x slowest. Spec E11.
+/// Places of M Gaussians in a unit voxel, [M, 3]: centres of the smallest cubic lattice with at
+/// least M cells, every cell where M is a cube and evenly spread ones elsewhere; x slowest. Spec
+/// E11.
 Tensor subLattice(int64_t m);
 
 /// Raw outputs for V voxels.
@@ -96,8 +99,8 @@ struct EncoderNet : torch::nn::Module {
   std::vector<std::shared_ptr<Mlp>> aggregate;
   Linear position_in{nullptr}, patch_in{nullptr}, geometry_in{nullptr}, posterior{nullptr},
       latent_in{nullptr}, gaussian_out{nullptr};
-  // Shallow ways around the transformers, for the mean colours of a token's octants: learned in minutes,
-  // where the deep way stayed grey for an hour.
+  // Shallow ways around the transformers, for the mean colours of a token's octants: learned in
+  // minutes, where the deep way stayed grey for an hour.
   Linear feature_shortcut{nullptr}, colour_shortcut{nullptr};
   torch::nn::LayerNorm posterior_norm{nullptr}, decoder_norm{nullptr}, gaussian_norm{nullptr};
   std::vector<std::shared_ptr<BidirectionalBlock>> blocks;
@@ -105,9 +108,9 @@ struct EncoderNet : torch::nn::Module {
   std::vector<Linear> child_logits, child_tokens;
 };
 
-/// Ground truth children plus false positives (E9): count = ratio * truth, half among children next to
-/// the truth (26 neighbours), half anywhere among the children. `occupied` [N, 8] bool, `coords` of
-/// the nodes. Returns [N, 8] bool.
+/// Ground truth children plus false positives (E9): count = ratio * truth, half among children next
+/// to the truth (26 neighbours), half anywhere among the children. `occupied` [N, 8] bool, `coords`
+/// of the nodes. Returns [N, 8] bool.
 Tensor injectFalsePositives(const Tensor& occupied, const std::vector<Coord>& coords, float ratio,
                             torch::Generator& random);
 

@@ -18,8 +18,8 @@ struct PixelPoint {
 };
 
 PatchLattice latticeOf(const View& view, int patches_across, int first) {
-  const int rows = std::max(1, int(std::lround(double(patches_across) * view.camera.height /
-                                               view.camera.width)));
+  const int rows = std::max(
+      1, int(std::lround(double(patches_across) * view.camera.height / view.camera.width)));
   return {patches_across, rows, first};
 }
 
@@ -28,11 +28,12 @@ std::vector<PixelPoint> pixelPoints(const View& view, const PatchLattice& lattic
                                     const Observation& o, const CarveSettings& carving) {
   const Camera& c = view.camera;
   const std::vector<float> depth = usableDepth(view.depthView(), carving);
-  const Eigen::Isometry3d grid_from_camera = o.frame.world_from_grid.inverse() * c.world_from_camera;
+  const Eigen::Isometry3d grid_from_camera =
+      o.frame.world_from_grid.inverse() * c.world_from_camera;
   auto point = [&](int x, int y) {
     const double z = depth[size_t(y) * size_t(c.width) + size_t(x)];
-    return Eigen::Vector3d(grid_from_camera *
-                           Eigen::Vector3d((x + .5 - c.cx) / c.fx * z, (y + .5 - c.cy) / c.fy * z, z));
+    return Eigen::Vector3d(grid_from_camera * Eigen::Vector3d((x + .5 - c.cx) / c.fx * z,
+                                                              (y + .5 - c.cy) / c.fy * z, z));
   };
   auto valid = [&](int x, int y) {
     return x >= 0 && y >= 0 && x < c.width && y < c.height &&
@@ -46,9 +47,11 @@ std::vector<PixelPoint> pixelPoints(const View& view, const PatchLattice& lattic
     for (int x = 0; x < c.width; ++x) {
       if (!valid(x, y)) continue;
       // The same arithmetic as carve(): the voxel of the world point.
-      const Eigen::Vector3d world = c.unproject(x + .5, y + .5, depth[size_t(y) * size_t(c.width) + size_t(x)]);
+      const Eigen::Vector3d world =
+          c.unproject(x + .5, y + .5, depth[size_t(y) * size_t(c.width) + size_t(x)]);
       const Eigen::Vector3d index = o.frame.toIndex(world);
-      const Coord ijk(int(std::floor(index.x())), int(std::floor(index.y())), int(std::floor(index.z())));
+      const Coord ijk(int(std::floor(index.x())), int(std::floor(index.y())),
+                      int(std::floor(index.z())));
       const int32_t row = o.tokens.row(0, ijk);
       if (row < 0) continue;
       Eigen::Vector3f normal = Eigen::Vector3f::Zero();
@@ -64,7 +67,9 @@ std::vector<PixelPoint> pixelPoints(const View& view, const PatchLattice& lattic
       }
       const int px = std::min(lattice.columns - 1, x * lattice.columns / c.width);
       const int py = std::min(lattice.rows - 1, y * lattice.rows / c.height);
-      points.push_back({row, lattice.first + py * lattice.columns + px, index.cast<float>(),
+      points.push_back({row,
+                        lattice.first + py * lattice.columns + px,
+                        index.cast<float>(),
                         {view.colour.at(x, y, 0), view.colour.at(x, y, 1), view.colour.at(x, y, 2)},
                         normal});
     }
@@ -135,8 +140,8 @@ void meanPatchPoints(const std::vector<View>& views,
     }
   for (size_t i = 0; i < views.size(); ++i) {
     const PatchLattice& l = o->lattices[i];
-    const float pixels = float(views[i].camera.width) * float(views[i].camera.height) /
-                         float(l.columns * l.rows);
+    const float pixels =
+        float(views[i].camera.width) * float(views[i].camera.height) / float(l.columns * l.rows);
     for (int p = l.first; p < l.first + l.columns * l.rows; ++p) {
       float* f = &o->patch_points[size_t(p) * 4];
       for (int c = 0; c < 3; ++c) f[c] /= std::max(1.f, f[3]);

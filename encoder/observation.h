@@ -23,17 +23,18 @@ struct PatchLattice {
 struct Observation {
   Observation(const VoxelFrame& f, const ObservedSpace& s) : frame(f), space(s), tokens(s.filled) {}
   VoxelFrame frame;
-  ObservedSpace space;                // F, E of the views
-  TokenGrid tokens;                   // of F
-  std::vector<float> voxel_features;  // [N0, kVoxelFeatures]
-  std::vector<PatchLattice> lattices; // one a view
-  int patches = 0;                    // of all views
+  ObservedSpace space;                 // F, E of the views
+  TokenGrid tokens;                    // of F
+  std::vector<float> voxel_features;   // [N0, kVoxelFeatures]
+  std::vector<PatchLattice> lattices;  // one a view
+  int patches = 0;                     // of all views
   /// Mean point of each patch's pixels in grid metres and its share of valid pixels, [patches, 4].
   std::vector<float> patch_points;
-  /// Pixels of patch p whose point lies in token v of the latent level, as compressed sparse rows over v.
-  std::vector<int32_t> row_begin;     // [N + 1]
-  std::vector<int32_t> patch;         // [nnz]
-  std::vector<float> count;           // [nnz]
+  /// Pixels of patch p whose point lies in token v of the latent level, as compressed sparse rows
+  /// over v.
+  std::vector<int32_t> row_begin;  // [N + 1]
+  std::vector<int32_t> patch;      // [nnz]
+  std::vector<float> count;        // [nnz]
 };
 
 struct ObservationSettings {
@@ -46,8 +47,9 @@ struct ObservationSettings {
 Observation observe(const std::vector<View>& views, const VoxelFrame& frame,
                     const ObservationSettings& settings, Progress& progress);
 
-/// The pixels of `view` whose surface was observed, [H * W], 1 or 0: those with a usable depth whose point
-/// lies in one of the observation's tokens of `level`. What a reconstruction can be held to.
+/// The pixels of `view` whose surface was observed, [H * W], 1 or 0: those with a usable depth
+/// whose point lies in one of the observation's tokens of `level`. What a reconstruction can be
+/// held to.
 std::vector<uint8_t> observedPixels(const View& view, const Observation& observation, int level,
                                     const CarveSettings& carving);
 

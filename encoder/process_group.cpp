@@ -14,7 +14,8 @@ struct ProcessGroup::Impl {
 
 namespace {
 
-constexpr std::chrono::minutes kPatience(5);  // a validation of the first process takes tens of seconds
+constexpr std::chrono::minutes kPatience(
+    5);  // a validation of the first process takes tens of seconds
 
 std::shared_ptr<gloo::transport::Device> device(const std::string& address) {
   if (const char* interface = std::getenv("GLOO_SOCKET_IFNAME"))
@@ -27,7 +28,8 @@ std::shared_ptr<gloo::transport::Device> device(const std::string& address) {
 }  // namespace
 
 ProcessGroup::ProcessGroup(const TrainProcesses& p) : rank_(p.rank), size_(p.size) {
-  require(p.size >= 1 && p.rank >= 0 && p.rank < p.size, "train: expected a rank in [0, ", p.size, "), found ", p.rank);
+  require(p.size >= 1 && p.rank >= 0 && p.rank < p.size, "train: expected a rank in [0, ", p.size,
+          "), found ", p.rank);
   if (size_ == 1) return;
   try {
     c10d::TCPStoreOptions options;
@@ -38,8 +40,8 @@ ProcessGroup::ProcessGroup(const TrainProcesses& p) : rank_(p.rank), size_(p.siz
     impl_ = std::make_unique<Impl>();
     impl_->gloo = c10::make_intrusive<c10d::ProcessGroupGloo>(store, rank_, size_, gloo_options);
   } catch (const std::exception& e) {
-    throw Error(joinText("train: process ", p.rank, " of ", p.size, ": cannot meet the others at ", p.address, ":",
-                         p.port, ": ", firstLine(e)));
+    throw Error(joinText("train: process ", p.rank, " of ", p.size, ": cannot meet the others at ",
+                         p.address, ":", p.port, ": ", firstLine(e)));
   }
 }
 
@@ -51,7 +53,8 @@ void ProcessGroup::sum(Tensor* values) {
   try {
     impl_->gloo->allreduce(one)->wait();
   } catch (const std::exception& e) {
-    throw Error(joinText("train: process ", rank_, " of ", size_, ": lost the others: ", firstLine(e)));
+    throw Error(
+        joinText("train: process ", rank_, " of ", size_, ": lost the others: ", firstLine(e)));
   }
 }
 

@@ -9,8 +9,8 @@ namespace vdbc {
 
 class ProcessGroup {
  public:
-  /// Waits for the others at the first process's address; alone (size 1) does nothing. Throws Error where
-  /// they cannot be reached within five minutes.
+  /// Waits for the others at the first process's address; alone (size 1) does nothing. Throws Error
+  /// where they cannot be reached within five minutes.
   explicit ProcessGroup(const TrainProcesses& processes);
   ~ProcessGroup();
   int rank() const { return rank_; }

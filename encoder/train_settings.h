@@ -22,13 +22,13 @@ struct TrainProcesses {
 };
 
 struct TrainSettings {
-  std::string weights_path;     // result: averaged weights (safetensors)
-  std::string work_folder;      // checkpoint, log.csv, validation pictures
+  std::string weights_path;  // result: averaged weights (safetensors)
+  std::string work_folder;   // checkpoint, log.csv, validation pictures
   int64_t steps = 4000;
-  int64_t batch = 1;            // samples a step, their gradients averaged; a multiple of the processes
+  int64_t batch = 1;  // samples a step, their gradients averaged; a multiple of the processes
   TrainProcesses processes;
   bool mixed_precision = false;  // matrix products in bfloat16; parameters and sums stay float32
-  double learning_rate = 8e-4;  // peak; linear warm-up, then cosine to 2 %
+  double learning_rate = 8e-4;   // peak; linear warm-up, then cosine to 2 %
   int64_t warmup = 150;
   double average_decay = .998;  // of the exponential moving average that is shipped
   double clip_norm = 1;
@@ -36,7 +36,7 @@ struct TrainSettings {
   int64_t checkpoint_every = 250;
   uint64_t seed = 1;
   bool resume = false;
-  std::string from;             // weights to start from instead of random ones; "" or of the same shapes
+  std::string from;  // weights to start from instead of random ones; "" or of the same shapes
   std::map<std::string, std::string> metadata;  // goes into the weights: scenes trained on, ...
 };
 

@@ -14,16 +14,23 @@ namespace fs = std::filesystem;
 Trainer::Trainer(std::shared_ptr<torch::nn::Module> net, std::shared_ptr<torch::nn::Module> average,
                  std::string config_key, std::string config, TrainSettings settings,
                  TrainListener listener)
-    : net_(std::move(net)), average_(std::move(average)), config_key_(std::move(config_key)),
-      config_(std::move(config)), settings_(std::move(settings)), listener_(std::move(listener)),
+    : net_(std::move(net)),
+      average_(std::move(average)),
+      config_key_(std::move(config_key)),
+      config_(std::move(config)),
+      settings_(std::move(settings)),
+      listener_(std::move(listener)),
       processes_(settings_.processes),
-      optimiser_(net_->parameters(), torch::optim::AdamWOptions(settings_.learning_rate)
-                                         .betas({.9, .98}).weight_decay(.01)) {
-  require(settings_.batch >= 1 && settings_.batch % processes_.size() == 0, "train: expected a batch that ",
-          processes_.size(), " processes can share evenly, found ", settings_.batch);
+      optimiser_(
+          net_->parameters(),
+          torch::optim::AdamWOptions(settings_.learning_rate).betas({.9, .98}).weight_decay(.01)) {
+  require(settings_.batch >= 1 && settings_.batch % processes_.size() == 0,
+          "train: expected a batch that ", processes_.size(), " processes can share evenly, found ",
+          settings_.batch);
   std::error_code error;
   fs::create_directories(settings_.work_folder, error);
-  require(!error, "train: ", settings_.work_folder, ": cannot create the folder: ", error.message());
+  require(!error, "train: ", settings_.work_folder,
+          ": cannot create the folder: ", error.message());
   torch::NoGradGuard no_grad;
   for (auto& p : average_->parameters()) p.set_requires_grad(false);
   if (settings_.resume) {
@@ -67,17 +74,20 @@ void Trainer::sumOverProcesses() {
 
 void Trainer::update() {
   sumOverProcesses();
-  const double rate = cosineRate(settings_.learning_rate, step_, settings_.steps, settings_.warmup, .02);
+  const double rate =
+      cosineRate(settings_.learning_rate, step_, settings_.steps, settings_.warmup, .02);
   static_cast<torch::optim::AdamWOptions&>(optimiser_.param_groups()[0].options()).lr(rate);
   const double norm = torch::nn::utils::clip_grad_norm_(net_->parameters(), settings_.clip_norm);
   if (std::isfinite(norm)) {
     optimiser_.step();
     // Early on the average follows closely, else it would remember the random start.
-    const double decay = std::min(settings_.average_decay, (1.0 + double(step_)) / (10.0 + double(step_)));
+    const double decay =
+        std::min(settings_.average_decay, (1.0 + double(step_)) / (10.0 + double(step_)));
     std::vector<Tensor> average = average_->parameters();
     updateAverage(average, net_->parameters(), decay);
   }
-  // To none, as a run that goes on finds them: what gets no gradient in a step is left alone, momentum too.
+  // To none, as a run that goes on finds them: what gets no gradient in a step is left alone,
+  // momentum too.
   for (const Tensor& p : net_->parameters()) p.mutable_grad() = Tensor();
   ++step_;
   auto add = [&](const std::string& name, double value) {
@@ -137,7 +147,8 @@ void Trainer::saveCheckpoint() const {
   addModule(*net_, "net.", &file);
   addModule(*average_, "average.", &file);
   for (const auto& p : net_->named_parameters()) {
-    const auto found = optimiser_.state().find(c10::guts::to_string(p.value().unsafeGetTensorImpl()));
+    const auto found =
+        optimiser_.state().find(c10::guts::to_string(p.value().unsafeGetTensorImpl()));
     if (found == optimiser_.state().end()) continue;
     const auto& state = static_cast<const torch::optim::AdamWParamState&>(*found->second);
     file.tensors["first." + p.key()] = state.exp_avg();

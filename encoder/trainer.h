@@ -1,6 +1,6 @@
 #pragma once
-// Private: what both training loops share: AdamW, schedule, batches over processes, averaging, checkpoints,
-// the log. Only the first process writes files and logs.
+// Private: what both training loops share: AdamW, schedule, batches over processes, averaging,
+// checkpoints, the log. Only the first process writes files and logs.
 #include <torch/optim/adamw.h>
 
 #include "encoder/layers.h"
@@ -17,19 +17,22 @@ class Trainer {
   /// `config_key` and `config` go into the files' metadata. With settings.resume continues from
   /// work_folder/checkpoint.safetensors; throws Error if there is none or it is of another network.
   Trainer(std::shared_ptr<torch::nn::Module> net, std::shared_ptr<torch::nn::Module> average,
-          std::string config_key, std::string config, TrainSettings settings, TrainListener listener);
+          std::string config_key, std::string config, TrainSettings settings,
+          TrainListener listener);
 
   int64_t step() const { return step_; }
   bool done() const { return step_ >= settings_.steps; }
-  /// Samples of the whole training are numbered; this step's are [step * batch, (step + 1) * batch), and
-  /// this process's among them:
+  /// Samples of the whole training are numbered; this step's are [step * batch, (step + 1) *
+  /// batch), and this process's among them:
   int64_t firstSample() const { return step_ * settings_.batch + processes_.rank() * samples(); }
   int64_t samples() const { return settings_.batch / processes_.size(); }
   /// Adds one sample's share of the gradient of the mean loss, and `values` to the log.
   void addSample(const Tensor& loss, const std::map<std::string, double>& values);
   /// One optimiser step from all samples' gradients; skips steps whose gradient is not finite.
   void update();
-  bool validationDue() const { return first() && (step_ % settings_.validate_every == 0 || done()); }
+  bool validationDue() const {
+    return first() && (step_ % settings_.validate_every == 0 || done());
+  }
   /// Writes a log row: means since the last one, and `values` of the validation.
   void log(std::map<std::string, double> values);
   void saveIfDue();

@@ -15,10 +15,14 @@ constexpr int64_t kMaxCount = int64_t(1) << 40;  // values of a tensor
 
 const char* typeName(torch::ScalarType type) {
   switch (type) {
-    case torch::kFloat32: return "F32";
-    case torch::kInt32: return "I32";
-    case torch::kInt64: return "I64";
-    default: throw Error("writeTensors: only float32, int32 and int64 tensors can be stored");
+    case torch::kFloat32:
+      return "F32";
+    case torch::kInt32:
+      return "I32";
+    case torch::kInt64:
+      return "I64";
+    default:
+      throw Error("writeTensors: only float32, int32 and int64 tensors can be stored");
   }
 }
 
@@ -64,7 +68,8 @@ TensorFile readTensors(const std::string& path) {
   require(in.good() && std::filesystem::is_regular_file(path), "readTensors: ", path,
           ": cannot open the file");
   const uint64_t size = uint64_t(in.tellg());
-  require(size >= 8, "readTensors: ", path, ": expected a safetensors file, found ", size, " bytes");
+  require(size >= 8, "readTensors: ", path, ": expected a safetensors file, found ", size,
+          " bytes");
   in.seekg(0);
   uint64_t length = 0;
   in.read(reinterpret_cast<char*>(&length), 8);
@@ -121,8 +126,8 @@ void loadModule(torch::nn::Module& module, const std::string& prefix, const Tens
             ", found none");
     require(found->second.sizes() == target.sizes(), "loadModule: ", path, ": ", prefix, name,
             ": expected shape ", target.sizes(), ", found ", found->second.sizes());
-    require(torch::isfinite(found->second).all().item<bool>(), "loadModule: ", path, ": ", prefix, name,
-            " contains NaN or infinity");
+    require(torch::isfinite(found->second).all().item<bool>(), "loadModule: ", path, ": ", prefix,
+            name, " contains NaN or infinity");
     target.copy_(found->second);
   };
   for (auto& p : module.named_parameters()) copy(p.key(), p.value());

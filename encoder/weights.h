@@ -23,7 +23,8 @@ void addModule(const torch::nn::Module& module, const std::string& prefix, Tenso
 void loadModule(torch::nn::Module& module, const std::string& prefix, const TensorFile& file,
                 const std::string& path);
 
-/// 16 hex digits that name the values of a module's parameters and buffers (FNV-1a over names and bytes).
+/// 16 hex digits that name the values of a module's parameters and buffers (FNV-1a over names and
+/// bytes).
 std::string weightsHash(const torch::nn::Module& module);
 
 }  // namespace vdbc

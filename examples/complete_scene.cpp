@@ -1,4 +1,5 @@
-// The main job as a library: complete_scene VIEWS WEIGHTS_FOLDER NAME writes NAME.vdb and its siblings.
+// The main job as a library: complete_scene VIEWS WEIGHTS_FOLDER NAME writes NAME.vdb and its
+// siblings.
 #include <cstdio>
 
 #include "houdini_style_tools/complete.h"

@@ -34,32 +34,44 @@ std::string hashOf(const TokenMask& mask) {
 }
 }  // namespace
 
-std::string completionIdentity(const Completer& completer, const LatentGrid& start, const CompleteSettings& s) {
-  return json{{"completer", completer.hash()}, {"start", hashOf(start)}, {"first_level", s.first_level}, {"tau", s.tau},
-              {"coarse_tau", s.coarse_tau}, {"hole_tau", s.hole_tau}, {"neighbours", int(s.neighbours)},
-              {"sampling_steps", s.sampling_steps}, {"temperature", s.temperature},
-              {"generated_context", s.generated_context}, {"refine_observed", s.refine_observed}, {"seed", s.seed},
+std::string completionIdentity(const Completer& completer, const LatentGrid& start,
+                               const CompleteSettings& s) {
+  return json{{"completer", completer.hash()},
+              {"start", hashOf(start)},
+              {"first_level", s.first_level},
+              {"tau", s.tau},
+              {"coarse_tau", s.coarse_tau},
+              {"hole_tau", s.hole_tau},
+              {"neighbours", int(s.neighbours)},
+              {"sampling_steps", s.sampling_steps},
+              {"temperature", s.temperature},
+              {"generated_context", s.generated_context},
+              {"refine_observed", s.refine_observed},
+              {"seed", s.seed},
               {"region", s.region ? hashOf(*s.region) : ""}}
       .dump();
 }
 
 void writeCheckpoint(const LatentGrid& so_far, int32_t next_level, const ObservedSpace& space,
-                     const std::string& encoder_hash, const std::string& identity, const std::string& path) {
+                     const std::string& encoder_hash, const std::string& identity,
+                     const std::string& path) {
   json growth = json::parse(identity);
   growth[kNextLevel] = next_level;
   writeLatentVdb({so_far, space, encoder_hash, growth.dump()}, path);
 }
 
-void readCheckpoint(const std::string& path, const std::string& encoder_hash, const std::string& identity,
-                    LatentGrid* start, CompleteSettings* settings) {
+void readCheckpoint(const std::string& path, const std::string& encoder_hash,
+                    const std::string& identity, LatentGrid* start, CompleteSettings* settings) {
   const LatentFile file = readLatentVdb(path);
   json growth = json::parse(file.growth, nullptr, false);
-  require(growth.is_object() && growth.contains(kNextLevel) && growth[kNextLevel].is_number_integer(), "--resume: ", path,
-          ": expected a completion that was cut short, found another latent file");
+  require(
+      growth.is_object() && growth.contains(kNextLevel) && growth[kNextLevel].is_number_integer(),
+      "--resume: ", path, ": expected a completion that was cut short, found another latent file");
   const int32_t next_level = growth[kNextLevel];
   growth.erase(kNextLevel);
   require(growth.dump() == identity && file.encoder_hash == encoder_hash, "--resume: ", path,
-          ": is of another place, settings or weights (expected ", identity, ", found ", growth.dump(), ")");
+          ": is of another place, settings or weights (expected ", identity, ", found ",
+          growth.dump(), ")");
   *start = file.latents;
   settings->first_level = next_level, settings->resumed = true;
 }

@@ -6,17 +6,19 @@
 
 namespace vdbc {
 
-/// What has to be equal for one completion to go on where another stopped (JSON): the completer, what it
-/// starts from and all settings.
-std::string completionIdentity(const Completer& completer, const LatentGrid& start, const CompleteSettings& settings);
+/// What has to be equal for one completion to go on where another stopped (JSON): the completer,
+/// what it starts from and all settings.
+std::string completionIdentity(const Completer& completer, const LatentGrid& start,
+                               const CompleteSettings& settings);
 
 /// Writes tokens so far and the next level. Throws Error where the file cannot be written.
 void writeCheckpoint(const LatentGrid& so_far, int32_t next_level, const ObservedSpace& space,
-                     const std::string& encoder_hash, const std::string& identity, const std::string& path);
+                     const std::string& encoder_hash, const std::string& identity,
+                     const std::string& path);
 
-/// Tokens so far instead of `start`; sets `settings->first_level` and `resumed`. Throws Error unless the
-/// file is there and of this identity and encoder.
-void readCheckpoint(const std::string& path, const std::string& encoder_hash, const std::string& identity,
-                    LatentGrid* start, CompleteSettings* settings);
+/// Tokens so far instead of `start`; sets `settings->first_level` and `resumed`. Throws Error
+/// unless the file is there and of this identity and encoder.
+void readCheckpoint(const std::string& path, const std::string& encoder_hash,
+                    const std::string& identity, LatentGrid* start, CompleteSettings* settings);
 
 }  // namespace vdbc

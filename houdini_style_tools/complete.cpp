@@ -35,10 +35,12 @@ Encoding encodeScene(const std::vector<View>& views, const Encoder& encoder,
   return e;
 }
 
-Completion completeLatents(const LatentGrid& start, const ObservedSpace& space, const Encoder& encoder,
-                           const Completer& completer, const SceneSettings& settings, Progress& progress,
+Completion completeLatents(const LatentGrid& start, const ObservedSpace& space,
+                           const Encoder& encoder, const Completer& completer,
+                           const SceneSettings& settings, Progress& progress,
                            const LevelListener& listener) {
-  Completion c{space, keepTokens(start, [&](size_t i) { return start.observed[i] != 0; }), {}, {}, {}};
+  Completion c{
+      space, keepTokens(start, [&](size_t i) { return start.observed[i] != 0; }), {}, {}, {}};
   c.whole = completer.complete(start, space, settings.completion, progress, listener);
   progress.start("decode");
   c.seen_decoded = encoder.decode(c.seen, space, settings.child_threshold, progress);
@@ -54,7 +56,8 @@ Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
   return completeLatents(e.latents, e.observation.space, encoder, completer, settings, progress);
 }
 
-SceneVoxels sceneVoxels(const DecodedGrid& d, const LatentGrid& latents, const ObservedSpace& space) {
+SceneVoxels sceneVoxels(const DecodedGrid& d, const LatentGrid& latents,
+                        const ObservedSpace& space) {
   SceneVoxels v;
   v.frame = latents.frame;
   v.ijk = d.voxels;
@@ -72,7 +75,8 @@ SceneVoxels sceneVoxels(const DecodedGrid& d, const LatentGrid& latents, const O
       clear *= 1 - opacity;
     }
     colour /= std::max(weight, 1e-6f);
-    v.colour_linear.emplace_back(linearFromSrgb(colour[0]), linearFromSrgb(colour[1]), linearFromSrgb(colour[2]));
+    v.colour_linear.emplace_back(linearFromSrgb(colour[0]), linearFromSrgb(colour[1]),
+                                 linearFromSrgb(colour[2]));
     v.density.push_back(1 - clear);
     const size_t node = size_t(d.node[i]);
     // A voxel was observed if a pixel's point lies in it; an observed token may gain unseen voxels.
@@ -99,10 +103,11 @@ namespace {
 constexpr int kTileWidth = 320;
 
 // From the mean camera place, four level headings, the first as the first view looks.
-std::vector<Camera> novelCameras(const std::vector<View>& views, const Eigen::Vector3d& up, int width,
-                                 int height) {
+std::vector<Camera> novelCameras(const std::vector<View>& views, const Eigen::Vector3d& up,
+                                 int width, int height) {
   Eigen::Vector3d place = Eigen::Vector3d::Zero();
-  for (const View& v : views) place += v.camera.world_from_camera.translation() / double(views.size());
+  for (const View& v : views)
+    place += v.camera.world_from_camera.translation() / double(views.size());
   Eigen::Vector3d forward = views[0].camera.world_from_camera.linear().col(2);
   forward -= up * forward.dot(up);
   if (forward.norm() < 1e-3) forward = up.unitOrthogonal();
@@ -113,7 +118,8 @@ std::vector<Camera> novelCameras(const std::vector<View>& views, const Eigen::Ve
     c.width = width, c.height = height;
     c.fx = c.fy = width / (2 * std::tan(.5 * 80 * M_PI / 180));  // 80 degrees across
     c.cx = width / 2., c.cy = height / 2.;
-    const Eigen::Vector3d z = Eigen::AngleAxisd(i * M_PI / 2, up) * forward, x = z.cross(up).normalized();
+    const Eigen::Vector3d z = Eigen::AngleAxisd(i * M_PI / 2, up) * forward,
+                          x = z.cross(up).normalized();
     c.world_from_camera.linear() << x, z.cross(x), z;
     c.world_from_camera.translation() = place;
     cameras.push_back(c);
@@ -123,22 +129,27 @@ std::vector<Camera> novelCameras(const std::vector<View>& views, const Eigen::Ve
 
 }  // namespace
 
-Image contactSheet(const std::vector<View>& views, const Completion& completion, const Eigen::Vector3d& up) {
+Image contactSheet(const std::vector<View>& views, const Completion& completion,
+                   const Eigen::Vector3d& up) {
   const int columns = 4, shown = std::min(columns, int(views.size()));
-  const int height = int(std::lround(double(kTileWidth) * views[0].camera.height / views[0].camera.width));
+  const int height =
+      int(std::lround(double(kTileWidth) * views[0].camera.height / views[0].camera.width));
   Image sheet(columns * kTileWidth, 3 * height, 3, .15f);
   for (int i = 0; i < shown; ++i) {
     const Camera& c = views[size_t(i)].camera;
     const double shrink = std::min(double(kTileWidth) / c.width, double(height) / c.height);
-    pasteImage(resizeImage(views[size_t(i)].colour, std::max(1, int(c.width * shrink)), std::max(1, int(c.height * shrink))),
-          i * kTileWidth, 0, &sheet);
+    pasteImage(resizeImage(views[size_t(i)].colour, std::max(1, int(c.width * shrink)),
+                           std::max(1, int(c.height * shrink))),
+               i * kTileWidth, 0, &sheet);
   }
   const std::vector<Camera> cameras = novelCameras(views, up, kTileWidth, height);
   RasterSettings settings;
   settings.antialias = completion.whole_decoded.gaussians.antialias;
   for (int i = 0; i < columns; ++i) {
-    pasteImage(rasterize(completion.seen_decoded.gaussians, cameras[size_t(i)], settings).colour, i * kTileWidth, height, &sheet);
-    pasteImage(rasterize(completion.whole_decoded.gaussians, cameras[size_t(i)], settings).colour, i * kTileWidth, 2 * height, &sheet);
+    pasteImage(rasterize(completion.seen_decoded.gaussians, cameras[size_t(i)], settings).colour,
+               i * kTileWidth, height, &sheet);
+    pasteImage(rasterize(completion.whole_decoded.gaussians, cameras[size_t(i)], settings).colour,
+               i * kTileWidth, 2 * height, &sheet);
   }
   return sheet;
 }
@@ -170,18 +181,22 @@ void writeTogether(const Writers& writers, const std::string& stem, Progress& pr
 }
 
 // The grids and Gaussians of a scene.
-Writers sceneWriters(const SceneVoxels& voxels, const Gaussians& gaussians, const Provenance& provenance,
-                     const Eigen::Vector3d& up) {
-  return {{".points.vdb", [&](const std::string& path) { writePointsVdb(gaussians, provenance, path); }},
-          {".ply", [&gaussians, up](const std::string& path) { writePly(gaussians, path, up.cast<float>()); }},
+Writers sceneWriters(const SceneVoxels& voxels, const Gaussians& gaussians,
+                     const Provenance& provenance, const Eigen::Vector3d& up) {
+  return {{".points.vdb",
+           [&](const std::string& path) { writePointsVdb(gaussians, provenance, path); }},
+          {".ply", [&gaussians,
+                    up](const std::string& path) { writePly(gaussians, path, up.cast<float>()); }},
           {".vdb", [&](const std::string& path) { writeSceneVdb(voxels, path); }}};
 }
 
 // A scene's files and `more`.
 void writeScene(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
-                const std::string& stem, const Eigen::Vector3d& up, const Writers& more, Progress& progress) {
+                const std::string& stem, const Eigen::Vector3d& up, const Writers& more,
+                Progress& progress) {
   const SceneVoxels voxels = sceneVoxels(decoded, latents, space);
-  const int64_t per_voxel = voxels.ijk.empty() ? 0 : decoded.gaussians.size() / int64_t(voxels.ijk.size());
+  const int64_t per_voxel =
+      voxels.ijk.empty() ? 0 : decoded.gaussians.size() / int64_t(voxels.ijk.size());
   const Provenance provenance = gaussianProvenance(voxels, per_voxel);
   Writers writers = sceneWriters(voxels, decoded.gaussians, provenance, up);
   writers.insert(writers.end(), more.begin(), more.end());
@@ -193,14 +208,16 @@ Eigen::Vector3d upOf(const VoxelFrame& frame) { return frame.world_from_grid.lin
 }  // namespace
 
 void requireCreatable(const std::string& path) {
-  const fs::path folder = fs::path(path).has_parent_path() ? fs::path(path).parent_path() : fs::path(".");
+  const fs::path folder =
+      fs::path(path).has_parent_path() ? fs::path(path).parent_path() : fs::path(".");
   if (!fs::exists(folder)) {
     std::error_code error;
     fs::create_directories(folder, error);
     require(!error, "--output: ", folder.string(), ": cannot create the folder: ", error.message());
   }
   require(fs::is_directory(folder), "--output: ", folder.string(), ": expected a folder");
-  require(!fs::is_directory(path), "--output: ", path, ": is a folder (expected a file, or nothing)");
+  require(!fs::is_directory(path), "--output: ", path,
+          ": is a folder (expected a file, or nothing)");
   // Asking the file system beats access(): root may pass access() on a read-only mount.
   const std::string probe = path + ".probe.tmp";
   std::FILE* f = std::fopen(probe.c_str(), "wb");
@@ -219,11 +236,15 @@ std::string outputStem(const std::string& path, const std::vector<std::string>& 
   return stem;
 }
 
-void writeCompletion(const std::vector<View>& views, const Completion& c, const std::string& encoder_hash,
-                     const std::string& stem, const Eigen::Vector3d& up, Progress& progress) {
-  Writers more = {{kLatentEnding, [&](const std::string& path) { writeLatentVdb({c.whole, c.space, encoder_hash, ""}, path); }}};
+void writeCompletion(const std::vector<View>& views, const Completion& c,
+                     const std::string& encoder_hash, const std::string& stem,
+                     const Eigen::Vector3d& up, Progress& progress) {
+  Writers more = {{kLatentEnding, [&](const std::string& path) {
+                     writeLatentVdb({c.whole, c.space, encoder_hash, ""}, path);
+                   }}};
   if (!views.empty())
-    more.push_back({kPictureEnding, [&](const std::string& path) { writePng(contactSheet(views, c, up), path); }});
+    more.push_back({kPictureEnding,
+                    [&](const std::string& path) { writePng(contactSheet(views, c, up), path); }});
   writeScene(c.whole_decoded, c.whole, c.space, stem, up, more, progress);
 }
 
@@ -232,13 +253,15 @@ void writeDecoded(const DecodedGrid& decoded, const LatentGrid& latents, const O
   writeScene(decoded, latents, space, stem, upOf(latents.frame), {}, progress);
 }
 
-Rethresholded rethreshold(const std::string& from, float tau, const std::string& to, Progress& progress) {
+Rethresholded rethreshold(const std::string& from, float tau, const std::string& to,
+                          Progress& progress) {
   progress.start("read");
   const std::string grids = from + ".vdb", points = from + ".points.vdb";
   const SceneVoxels all = readSceneVdb(grids);
   Provenance origin;
   Gaussians gaussians = readPointsVdb(points, &origin);
-  require(origin.recorded, "rethreshold: ", points, ": expected Gaussians with `probability` and `completed`, found neither");
+  require(origin.recorded, "rethreshold: ", points,
+          ": expected Gaussians with `probability` and `completed`, found neither");
   progress.end();
   SceneVoxels kept;
   kept.frame = all.frame;
@@ -249,14 +272,15 @@ Rethresholded rethreshold(const std::string& from, float tau, const std::string&
     kept.density.push_back(all.density[i]), kept.observed.push_back(all.observed[i]);
     kept.probability.push_back(all.probability[i]), kept.bfs_level.push_back(all.bfs_level[i]);
   }
-  require(kept.ijk.size() < all.ijk.size(), "rethreshold: ", grids, ": every generated voxel exceeds ", tau,
-          " already (expected a tau that is larger)");
+  require(kept.ijk.size() < all.ijk.size(), "rethreshold: ", grids,
+          ": every generated voxel exceeds ", tau, " already (expected a tau that is larger)");
   std::vector<int64_t> rows;
   Provenance provenance;
   for (size_t i = 0; i < origin.generated.size(); ++i) {
     if (origin.generated[i] && !(origin.probability[i] > tau)) continue;
     rows.push_back(int64_t(i));
-    provenance.generated.push_back(origin.generated[i]), provenance.probability.push_back(origin.probability[i]);
+    provenance.generated.push_back(origin.generated[i]),
+        provenance.probability.push_back(origin.probability[i]);
   }
   gaussians = selectGaussians(gaussians, rows);
   writeTogether(sceneWriters(kept, gaussians, provenance, upOf(kept.frame)), to, progress);

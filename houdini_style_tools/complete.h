@@ -11,10 +11,10 @@
 namespace vdbc {
 
 struct SceneSettings {
-  VolumeSettings volume;          // voxel size comes from the encoder's weights
+  VolumeSettings volume;  // voxel size comes from the encoder's weights
   CarveSettings carving;
   CompleteSettings completion;
-  float child_threshold = .05f;   // of BCE-up, for voxels that were not observed
+  float child_threshold = .05f;  // of BCE-up, for voxels that were not observed
 };
 
 /// What was observed, encoded.
@@ -25,8 +25,8 @@ struct Encoding {
 
 /// A completed place, before it is written.
 struct Completion {
-  ObservedSpace space;            // what the views saw filled and empty
-  LatentGrid seen, whole;         // latents of the observed tokens; the same and generated ones
+  ObservedSpace space;     // what the views saw filled and empty
+  LatentGrid seen, whole;  // latents of the observed tokens; the same and generated ones
   DecodedGrid seen_decoded, whole_decoded;
 };
 
@@ -43,19 +43,22 @@ Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
                          const Completer& completer, const SceneSettings& settings,
                          Progress& progress);
 
-/// Completes and decodes what is encoded already: observed tokens, after them generated ones that stay
-/// (Completer::complete).
-Completion completeLatents(const LatentGrid& start, const ObservedSpace& space, const Encoder& encoder,
-                           const Completer& completer, const SceneSettings& settings, Progress& progress,
+/// Completes and decodes what is encoded already: observed tokens, after them generated ones that
+/// stay (Completer::complete).
+Completion completeLatents(const LatentGrid& start, const ObservedSpace& space,
+                           const Encoder& encoder, const Completer& completer,
+                           const SceneSettings& settings, Progress& progress,
                            const LevelListener& listener = nullptr);
 
-/// Voxels with colour, density and provenance, from decoded content. A voxel's probability is its token's.
-SceneVoxels sceneVoxels(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space);
+/// Voxels with colour, density and provenance, from decoded content. A voxel's probability is its
+/// token's.
+SceneVoxels sceneVoxels(const DecodedGrid& decoded, const LatentGrid& latents,
+                        const ObservedSpace& space);
 /// Provenance of each Gaussian.
 Provenance gaussianProvenance(const SceneVoxels& voxels, int64_t gaussians_per_voxel);
 
-/// Picture: a row of input views, then for novel views (the mean camera place, four headings) a row as
-/// observed and a row as completed.
+/// Picture: a row of input views, then for novel views (the mean camera place, four headings) a row
+/// as observed and a row as completed.
 Image contactSheet(const std::vector<View>& views, const Completion& completion,
                    const Eigen::Vector3d& up);
 
@@ -67,14 +70,15 @@ constexpr const char* kSceneEndings[] = {".points.vdb", ".ply", ".vdb"};
 constexpr const char* kLatentEnding = ".latent.vdb";
 constexpr const char* kPictureEnding = ".png";
 
-/// X of an output path X.vdb. Throws Error unless X.vdb can be created beside its siblings, those of
-/// kSceneEndings and `more`; called before any long work.
+/// X of an output path X.vdb. Throws Error unless X.vdb can be created beside its siblings, those
+/// of kSceneEndings and `more`; called before any long work.
 std::string outputStem(const std::string& vdb_path, const std::vector<std::string>& more);
 
-/// X.vdb, X.points.vdb, X.ply, X.latent.vdb (by the encoder of that hash) and X.png, which needs views.
-/// All are written to temporary names; a failure leaves none of this run's files behind.
-void writeCompletion(const std::vector<View>& views, const Completion& completion, const std::string& encoder_hash,
-                     const std::string& stem, const Eigen::Vector3d& up, Progress& progress);
+/// X.vdb, X.points.vdb, X.ply, X.latent.vdb (by the encoder of that hash) and X.png, which needs
+/// views. All are written to temporary names; a failure leaves none of this run's files behind.
+void writeCompletion(const std::vector<View>& views, const Completion& completion,
+                     const std::string& encoder_hash, const std::string& stem,
+                     const Eigen::Vector3d& up, Progress& progress);
 
 /// X.vdb, X.points.vdb and X.ply from decoded latents alone; up is the grid's z.
 void writeDecoded(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
@@ -83,10 +87,11 @@ void writeDecoded(const DecodedGrid& decoded, const LatentGrid& latents, const O
 struct Rethresholded {
   int64_t voxels = 0, gaussians = 0, dropped_voxels = 0;
 };
-/// Raises tau of a finished place without any network: `from`.vdb and `from`.points.vdb less the generated
-/// voxels and Gaussians whose probability does not exceed tau, also those that close holes, as `to`.vdb,
-/// `to`.points.vdb, `to`.ply.
-/// Throws Error where a file is missing or unreadable, and if every generated voxel exceeds tau.
-Rethresholded rethreshold(const std::string& from, float tau, const std::string& to, Progress& progress);
+/// Raises tau of a finished place without any network: `from`.vdb and `from`.points.vdb less the
+/// generated voxels and Gaussians whose probability does not exceed tau, also those that close
+/// holes, as `to`.vdb, `to`.points.vdb, `to`.ply. Throws Error where a file is missing or
+/// unreadable, and if every generated voxel exceeds tau.
+Rethresholded rethreshold(const std::string& from, float tau, const std::string& to,
+                          Progress& progress);
 
 }  // namespace vdbc

@@ -48,8 +48,8 @@ void Console::draw(int percent, bool finished) {
   const double seconds =
       std::chrono::duration<double>(std::chrono::steady_clock::now() - started_).count();
   if (json_) {
-    std::fprintf(stderr, "{\"stage\": \"%s\", \"percent\": %d, \"seconds\": %.2f}\n", stage_.c_str(),
-                 percent, seconds);
+    std::fprintf(stderr, "{\"stage\": \"%s\", \"percent\": %d, \"seconds\": %.2f}\n",
+                 stage_.c_str(), percent, seconds);
   } else if (terminal_) {
     std::fprintf(stderr, "\r\033[K%-22s %3d %%  %.1f s%s", stage_.c_str(), percent, seconds,
                  finished ? "\n" : "");

@@ -8,8 +8,8 @@
 
 namespace vdbc {
 
-/// Draws one line per stage on stderr where that is a terminal; with `json` writes one JSON object a
-/// line to stderr instead. wasInterrupted() turns true after SIGINT or SIGTERM.
+/// Draws one line per stage on stderr where that is a terminal; with `json` writes one JSON object
+/// a line to stderr instead. wasInterrupted() turns true after SIGINT or SIGTERM.
 class Console : public Progress {
  public:
   /// Installs the signal handlers (once per process is enough).

@@ -31,19 +31,23 @@ EvaluationScene roomScene(Room room, uint64_t seed, int views) {
   const RoomRenderer renderer(room);
   // The same targets for any number of input views up to that of training.
   const int inputs = std::max(views, kRoomViews);
-  const std::vector<Camera> cameras = roomCameras(room, renderer, inputs + kTargetViews, kRoomSide, kRoomSide, seed);
+  const std::vector<Camera> cameras =
+      roomCameras(room, renderer, inputs + kTargetViews, kRoomSide, kRoomSide, seed);
   for (int i = 0; i < int(cameras.size()); ++i)
     if (i < views || i >= inputs)
-      (i < views ? s.input : s.targets).push_back(renderer.render(cameras[size_t(i)], kRoomSamples, seed + uint64_t(i)));
+      (i < views ? s.input : s.targets)
+          .push_back(renderer.render(cameras[size_t(i)], kRoomSamples, seed + uint64_t(i)));
   s.truth = solidMesh(room.surface), s.shell = shellMesh(room);
   s.free_points = freePoints(room, 64, seed);
-  s.is_within = [kept = std::make_shared<const Room>(std::move(room))](const Eigen::Vector3f& p_world) {
-    return isWithin(*kept, kept->world_from_room.inverse() * p_world);
-  };
+  s.is_within =
+      [kept = std::make_shared<const Room>(std::move(room))](const Eigen::Vector3f& p_world) {
+        return isWithin(*kept, kept->world_from_room.inverse() * p_world);
+      };
   return s;
 }
 
-EvaluationScene folderScene(const std::string& folder, int views, std::vector<int> frames, uint64_t seed) {
+EvaluationScene folderScene(const std::string& folder, int views, std::vector<int> frames,
+                            uint64_t seed) {
   EvaluationScene s;
   s.name = folder;
   s.up = conventionalUp(folder);
@@ -61,15 +65,18 @@ EvaluationScene folderScene(const std::string& folder, int views, std::vector<in
     const bool input = std::find(frames.begin(), frames.end(), f) != frames.end();
     (input ? s.input : s.targets).push_back(all[size_t(f)]);
   }
-  require(s.input.size() == frames.size(), "eval: ", folder, ": --frames: expected different numbers below ",
-          all.size());
+  require(s.input.size() == frames.size(), "eval: ", folder,
+          ": --frames: expected different numbers below ", all.size());
   return s;
 }
 
-Eigen::Vector3d centreOf(const Coord& node) { return {2. * node.x() + 1, 2. * node.y() + 1, 2. * node.z() + 1}; }
+Eigen::Vector3d centreOf(const Coord& node) {
+  return {2. * node.x() + 1, 2. * node.y() + 1, 2. * node.z() + 1};
+}
 
 // An opaque-looking Gaussian for a node of level 1.
-void addNode(const VoxelFrame& frame, const Coord& node, const Eigen::Vector3f& srgb, Gaussians* g) {
+void addNode(const VoxelFrame& frame, const Coord& node, const Eigen::Vector3f& srgb,
+             Gaussians* g) {
   addIsotropic(frame.toWorld(centreOf(node)), frame.voxel_m, srgb, g);
 }
 
@@ -84,15 +91,17 @@ void addVoxelsOfNode(const Coord& node, std::vector<Coord>* voxels) {
   for (int slot = 0; slot < 8; ++slot) voxels->push_back(childCoord(node, slot));
 }
 
-// Every unobserved node of the volume takes the colour of the nearest observed voxel. The nearest one is
-// found by growing from the observed nodes, ring by ring.
-MethodOutput nearestFill(const MethodOutput& observed, const SceneVoxels& seen, const NodeStates& states) {
+// Every unobserved node of the volume takes the colour of the nearest observed voxel. The nearest
+// one is found by growing from the observed nodes, ring by ring.
+MethodOutput nearestFill(const MethodOutput& observed, const SceneVoxels& seen,
+                         const NodeStates& states) {
   MethodOutput out = observed;
   std::map<Coord, Eigen::Vector3f> colour;
   for (size_t i = 0; i < seen.ijk.size(); ++i) {
     const auto& c = seen.colour_linear[i];
-    colour.emplace(tokenCoord(seen.ijk[i], 1),
-                   Eigen::Vector3f(srgbFromLinear(c[0]), srgbFromLinear(c[1]), srgbFromLinear(c[2])));
+    colour.emplace(
+        tokenCoord(seen.ijk[i], 1),
+        Eigen::Vector3f(srgbFromLinear(c[0]), srgbFromLinear(c[1]), srgbFromLinear(c[2])));
   }
   std::vector<Coord> ring;
   for (const auto& entry : colour) ring.push_back(entry.first);
@@ -119,9 +128,10 @@ MethodOutput nearestFill(const MethodOutput& observed, const SceneVoxels& seen, 
   return out;
 }
 
-// Floor, ceiling and walls fitted to what was seen (the box of the seen voxels, a half per cent trimmed at
-// each side); its unobserved nodes take the mean colour.
-MethodOutput manhattanBox(const MethodOutput& observed, const SceneVoxels& seen, const NodeStates& states) {
+// Floor, ceiling and walls fitted to what was seen (the box of the seen voxels, a half per cent
+// trimmed at each side); its unobserved nodes take the mean colour.
+MethodOutput manhattanBox(const MethodOutput& observed, const SceneVoxels& seen,
+                          const NodeStates& states) {
   MethodOutput out = observed;
   Coord lo, hi;
   for (int axis = 0; axis < 3; ++axis) {
@@ -135,8 +145,8 @@ MethodOutput manhattanBox(const MethodOutput& observed, const SceneVoxels& seen,
   const CoordBBox box(lo, hi);
   for (auto i = box.begin(); i; ++i) {
     const Coord node = *i;
-    const bool face = node.x() == lo.x() || node.x() == hi.x() || node.y() == lo.y() || node.y() == hi.y() ||
-                      node.z() == lo.z() || node.z() == hi.z();
+    const bool face = node.x() == lo.x() || node.x() == hi.x() || node.y() == lo.y() ||
+                      node.y() == hi.y() || node.z() == lo.z() || node.z() == hi.z();
     if (!face || states.at(node) != NodeState::kUnobserved) continue;
     addNode(seen.frame, node, colour, &out.gaussians);
     addVoxelsOfNode(node, &out.voxels);
@@ -144,7 +154,8 @@ MethodOutput manhattanBox(const MethodOutput& observed, const SceneVoxels& seen,
   return out;
 }
 
-// What the target views' cameras see of the Gaussians, against what is there; keeps the first pictures in `shown`.
+// What the target views' cameras see of the Gaussians, against what is there; keeps the first
+// pictures in `shown`.
 void measurePictures(const EvaluationScene& scene, const Gaussians& gaussians, const UserNets& nets,
                      MethodResult* r, std::vector<Image>* shown) {
   const double share = 1 / double(scene.targets.size());
@@ -194,7 +205,8 @@ struct UnseenNodes {
 
 void measureNodes(const EvaluationScene& scene, const VoxelFrame& frame, const UnseenNodes& unseen,
                   const std::vector<Coord>& voxels, MethodResult* r) {
-  r->precision = r->recall = r->f1 = r->iou = r->shell_recall = r->furniture_recall = r->outside = r->leak = kNan;
+  r->precision = r->recall = r->f1 = r->iou = r->shell_recall = r->furniture_recall = r->outside =
+      r->leak = kNan;
   if (!scene.truth) return;
   std::vector<Coord> nodes;
   for (const Coord& voxel : voxels) nodes.push_back(tokenCoord(voxel, 1));
@@ -212,14 +224,16 @@ Eigen::MatrixXd rowsOf(const std::vector<std::vector<float>>& rows) {
   for (size_t i = 0; i < rows.size(); ++i) {
     require(rows[i].size() == rows[0].size(), "--features: expected ", rows[0].size(),
             " features of every picture, found ", rows[i].size());
-    m.row(Eigen::Index(i)) = Eigen::Map<const Eigen::RowVectorXf>(rows[i].data(), m.cols()).cast<double>();
+    m.row(Eigen::Index(i)) =
+        Eigen::Map<const Eigen::RowVectorXf>(rows[i].data(), m.cols()).cast<double>();
   }
   return m;
 }
 
 }  // namespace
 
-SceneList sceneList(const std::string& spec, int views, const std::vector<int>& frames, uint64_t seed) {
+SceneList sceneList(const std::string& spec, int views, const std::vector<int>& frames,
+                    uint64_t seed) {
   const bool is_rooms = spec.rfind("rooms:", 0) == 0, is_homes = spec.rfind("homes:", 0) == 0;
   if (!is_rooms && !is_homes)
     return {1, [=](int64_t) { return folderScene(spec, views, frames, seed); }};
@@ -229,7 +243,8 @@ SceneList sceneList(const std::string& spec, int views, const std::vector<int>& 
   const int found = std::sscanf(text, "%llu%n-%llu%n", &first, &used, &last, &used);
   if (found == 1) last = first;
   if (found < 1 || text[used] != '\0' || last < first || last - first > 100000)
-    throw UsageError(joinText("--scenes: ", spec, ": expected rooms:N, rooms:N-N, homes:N or homes:N-N"));
+    throw UsageError(
+        joinText("--scenes: ", spec, ": expected rooms:N, rooms:N-N, homes:N or homes:N-N"));
   if (!frames.empty()) throw UsageError("--frames: expected a folder as --scenes, found rooms");
   if (is_rooms) {
     for (uint64_t s : {uint64_t(first), uint64_t(last)}) requireHeldOut(s);
@@ -251,13 +266,15 @@ SceneList sceneList(const std::string& spec, int views, const std::vector<int>& 
 SetScores setScores(const std::set<Coord>& filled, const std::set<Coord>& truth) {
   double hit = 0;
   for (const Coord& node : filled) hit += double(truth.count(node));
-  return {filled.empty() ? kNan : hit / double(filled.size()), truth.empty() ? kNan : hit / double(truth.size()),
-          filled.empty() && truth.empty() ? kNan : 2 * hit / double(truth.size() + filled.size()),
-          filled.empty() && truth.empty() ? kNan : hit / (double(truth.size() + filled.size()) - hit)};
+  return {
+      filled.empty() ? kNan : hit / double(filled.size()),
+      truth.empty() ? kNan : hit / double(truth.size()),
+      filled.empty() && truth.empty() ? kNan : 2 * hit / double(truth.size() + filled.size()),
+      filled.empty() && truth.empty() ? kNan : hit / (double(truth.size() + filled.size()) - hit)};
 }
 
-int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame, const std::set<Coord>& filled,
-                     const std::set<Coord>& truth) {
+int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame,
+                     const std::set<Coord>& filled, const std::set<Coord>& truth) {
   return std::count_if(filled.begin(), filled.end(), [&](const Coord& node) {
     return !truth.count(node) && !scene.is_within(frame.toWorld(centreOf(node)).cast<float>());
   });
@@ -281,12 +298,14 @@ double calibrationError(const Reliability& reliability) {
   return count > 0 ? error / count : kNan;
 }
 
-double sceneLeak(const EvaluationScene& scene, const VoxelFrame& frame, const std::vector<Coord>& voxels) {
-  return leakRate(RayTarget::fromMesh(*scene.truth), RayTarget::fromVoxels(frame, voxels), scene.free_points,
-                  kLeakRays, 2 * frame.voxel_m, 1);
+double sceneLeak(const EvaluationScene& scene, const VoxelFrame& frame,
+                 const std::vector<Coord>& voxels) {
+  return leakRate(RayTarget::fromMesh(*scene.truth), RayTarget::fromVoxels(frame, voxels),
+                  scene.free_points, kLeakRays, 2 * frame.voxel_m, 1);
 }
 
-void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vector3f& srgb, Gaussians* g) {
+void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vector3f& srgb,
+                  Gaussians* g) {
   g->mean.push_back(mean.cast<float>());
   g->log_scale.push_back(Eigen::Vector3f::Constant(float(std::log(sigma_m))));
   g->rotation.emplace_back(1, 0, 0, 0);
@@ -294,9 +313,11 @@ void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vect
   for (int c = 0; c < 3; ++c) g->sh.push_back((srgb[c] - .5f) / kSh0);
 }
 
-Gaussians pixelAligned(const std::vector<View>& views, const std::vector<std::vector<uint8_t>>& observed) {
-  // Of .3, .4, .5, .7, 1, 1.4 and 2 best on views that are not among the input of validation rooms 900000-900003,
-  // 12 views in (21.5 dB; .4: 21.4, .7: 21.3, 1: 20.8): wider blurs, narrower leaves gaps where surfaces slope.
+Gaussians pixelAligned(const std::vector<View>& views,
+                       const std::vector<std::vector<uint8_t>>& observed) {
+  // Of .3, .4, .5, .7, 1, 1.4 and 2 best on views that are not among the input of validation rooms
+  // 900000-900003, 12 views in (21.5 dB; .4: 21.4, .7: 21.3, 1: 20.8): wider blurs, narrower leaves
+  // gaps where surfaces slope.
   constexpr double kSigmaPixels = .5;
   Gaussians g;
   for (size_t i = 0; i < views.size(); ++i) {
@@ -319,21 +340,32 @@ void writeColumns(const std::vector<std::vector<Image>>& columns, const std::str
   Image sheet(width * int(columns.size()), height * int(columns[0].size()), 3);
   for (size_t c = 0; c < columns.size(); ++c)
     for (size_t r = 0; r < columns[c].size(); ++r)
-      pasteImage(resizeImage(columns[c][r], width, height), int(c) * width, int(r) * height, &sheet);
+      pasteImage(resizeImage(columns[c][r], width, height), int(c) * width, int(r) * height,
+                 &sheet);
   writePng(sheet, path);
 }
 
 namespace {
 const std::vector<Score<MethodResult>> kScores = {
-    {"psnr", &MethodResult::psnr}, {"ssim", &MethodResult::ssim}, {"flip", &MethodResult::flip},
-    {"lpips", &MethodResult::lpips}, {"fid", &MethodResult::fid}, {"kid", &MethodResult::kid},
-    {"depth_median_m", &MethodResult::depth_median_m}, {"depth_rmse_m", &MethodResult::depth_rmse_m},
+    {"psnr", &MethodResult::psnr},
+    {"ssim", &MethodResult::ssim},
+    {"flip", &MethodResult::flip},
+    {"lpips", &MethodResult::lpips},
+    {"fid", &MethodResult::fid},
+    {"kid", &MethodResult::kid},
+    {"depth_median_m", &MethodResult::depth_median_m},
+    {"depth_rmse_m", &MethodResult::depth_rmse_m},
     {"depth_share", &MethodResult::depth_share},
-    {"precision", &MethodResult::precision}, {"recall", &MethodResult::recall}, {"f1", &MethodResult::f1},
-    {"iou", &MethodResult::iou}, {"shell_recall", &MethodResult::shell_recall},
-    {"furniture_recall", &MethodResult::furniture_recall}, {"outside", &MethodResult::outside},
+    {"precision", &MethodResult::precision},
+    {"recall", &MethodResult::recall},
+    {"f1", &MethodResult::f1},
+    {"iou", &MethodResult::iou},
+    {"shell_recall", &MethodResult::shell_recall},
+    {"furniture_recall", &MethodResult::furniture_recall},
+    {"outside", &MethodResult::outside},
     {"ece", &MethodResult::ece},
-    {"leak", &MethodResult::leak}, {"seconds", &MethodResult::seconds},
+    {"leak", &MethodResult::leak},
+    {"seconds", &MethodResult::seconds},
     {"peak_rss_mb", &MethodResult::peak_rss_mb}};
 }  // namespace
 
@@ -341,8 +373,10 @@ std::string resultJson(const MethodResult& r) { return scoresJson(r, kScores); }
 
 std::string reliabilityJson(const MethodResult& r) {
   nlohmann::ordered_json bins = nlohmann::ordered_json::array();
-  for (const ReliabilityBin& bin : *r.reliability) bins.push_back({bin.count, bin.sum_probability, bin.hits});
-  return nlohmann::ordered_json{{"scene", r.scene}, {"views", r.views}, {"method", r.method}, {"reliability", bins}}
+  for (const ReliabilityBin& bin : *r.reliability)
+    bins.push_back({bin.count, bin.sum_probability, bin.hits});
+  return nlohmann::ordered_json{
+      {"scene", r.scene}, {"views", r.views}, {"method", r.method}, {"reliability", bins}}
       .dump();
 }
 
@@ -364,7 +398,8 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
 
   std::vector<MethodResult> results;
   std::vector<std::vector<Image>> columns(1);
-  for (size_t i = 0; i < std::min(kShownViews, scene.targets.size()); ++i) columns[0].push_back(scene.targets[i].colour);
+  for (size_t i = 0; i < std::min(kShownViews, scene.targets.size()); ++i)
+    columns[0].push_back(scene.targets[i].colour);
   auto add = [&](const std::string& method, const MethodOutput& output, double seconds) {
     MethodResult r;
     r.scene = scene.name, r.method = method, r.views = int(scene.input.size());
@@ -409,8 +444,8 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
     results.back().reliability = reliabilityOf(c.whole, unseen.truth);
     results.back().ece = calibrationError(*results.back().reliability);
     start = std::chrono::steady_clock::now();
-    const LatentGrid oracle = completer.completeAt(c.seen, c.space,
-                                                   surfaceNodes(*scene.truth, frame, 1), s.completion, progress);
+    const LatentGrid oracle = completer.completeAt(
+        c.seen, c.space, surfaceNodes(*scene.truth, frame, 1), s.completion, progress);
     const DecodedGrid d = encoder.decode(oracle, c.space, s.child_threshold, progress);
     add("oracle-occupancy", {d.gaussians, d.voxels}, observed_seconds + secondsSince(start));
   }
@@ -419,7 +454,8 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
     s.completion.tau = float(tau);
     start = std::chrono::steady_clock::now();
     const Completion other = completeLatents(c.seen, c.space, encoder, completer, s, progress);
-    add(joinText("completed-tau-", tau), {other.whole_decoded.gaussians, other.whole_decoded.voxels},
+    add(joinText("completed-tau-", tau),
+        {other.whole_decoded.gaussians, other.whole_decoded.voxels},
         observed_seconds + secondsSince(start));
   }
   return results;
@@ -431,7 +467,8 @@ std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results) 
     for (const MethodResult& r : results) {
       if (r.method != mean.method) continue;
       mean.features.insert(mean.features.end(), r.features.begin(), r.features.end());
-      mean.true_features.insert(mean.true_features.end(), r.true_features.begin(), r.true_features.end());
+      mean.true_features.insert(mean.true_features.end(), r.true_features.begin(),
+                                r.true_features.end());
       if (!r.reliability) continue;
       if (!mean.reliability) mean.reliability.emplace();
       for (size_t i = 0; i < r.reliability->size(); ++i) {

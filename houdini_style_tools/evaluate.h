@@ -23,19 +23,22 @@ struct EvaluationScene {
   std::string name;
   std::vector<View> input, targets;
   Eigen::Vector3d up = Eigen::Vector3d::UnitZ();
-  std::optional<TriangleMesh> truth, shell;  // all solid surfaces, and those of the room itself (shellMesh)
+  std::optional<TriangleMesh> truth,
+      shell;  // all solid surfaces, and those of the room itself (shellMesh)
   std::vector<Eigen::Vector3f> free_points;  // origins of leak rays; empty without truth
-  std::function<bool(const Eigen::Vector3f& p_world)> is_within;  // the room (isWithin); empty without truth
+  std::function<bool(const Eigen::Vector3f& p_world)>
+      is_within;  // the room (isWithin); empty without truth
 };
 
-/// Scenes named by SPEC: `rooms:SEED-SEED` (or rooms:SEED), or a folder with transforms.json of which
-/// `views` random frames, or those of `frames`, are input and the rest targets.
+/// Scenes named by SPEC: `rooms:SEED-SEED` (or rooms:SEED), or a folder with transforms.json of
+/// which `views` random frames, or those of `frames`, are input and the rest targets.
 struct SceneList {
   int64_t count = 0;
   std::function<EvaluationScene(int64_t)> scene;
 };
 /// Throws UsageError for a malformed SPEC, Error for seeds reserved for training.
-SceneList sceneList(const std::string& spec, int views, const std::vector<int>& frames, uint64_t seed);
+SceneList sceneList(const std::string& spec, int views, const std::vector<int>& frames,
+                    uint64_t seed);
 
 /// A set of nodes against the true one; NaN is 0/0.
 struct SetScores {
@@ -43,13 +46,15 @@ struct SetScores {
 };
 SetScores setScores(const std::set<Coord>& filled, const std::set<Coord>& truth);
 
-/// How many of `filled`, nodes of level 1 of the frame's grid, lie outside the scene's room: they are not in `truth`, the
-/// nodes that its surfaces pass, and their centre is not over its floor and below its ceilings. What stands behind the
-/// shell, exactly; a false node in a cupboard is not outside, one in the next room of a home is.
-int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame, const std::set<Coord>& filled,
-                     const std::set<Coord>& truth);
+/// How many of `filled`, nodes of level 1 of the frame's grid, lie outside the scene's room: they
+/// are not in `truth`, the nodes that its surfaces pass, and their centre is not over its floor and
+/// below its ceilings. What stands behind the shell, exactly; a false node in a cupboard is not
+/// outside, one in the next room of a home is.
+int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame,
+                     const std::set<Coord>& filled, const std::set<Coord>& truth);
 
-/// Generated nodes by their stored probability: bin i of ten holds [i, i + 1) / 10, the last one also 1.
+/// Generated nodes by their stored probability: bin i of ten holds [i, i + 1) / 10, the last one
+/// also 1.
 struct ReliabilityBin {
   int64_t count = 0, hits = 0;  // hits: in the truth
   double sum_probability = 0;
@@ -57,22 +62,26 @@ struct ReliabilityBin {
 using Reliability = std::array<ReliabilityBin, 10>;
 /// Of the generated rows of `latents`; `truth` are nodes of their level.
 Reliability reliabilityOf(const LatentGrid& latents, const std::set<Coord>& truth);
-/// Expected calibration error: mean over the nodes of |share of hits - mean probability| of their bin (Naeini et al.
-/// 2015). NaN without nodes.
+/// Expected calibration error: mean over the nodes of |share of hits - mean probability| of their
+/// bin (Naeini et al. 2015). NaN without nodes.
 double calibrationError(const Reliability& reliability);
 
-/// Share of rays from the free points of a scene with truth that meet none of `voxels` before they have
-/// passed the true surface by two voxels.
-double sceneLeak(const EvaluationScene& scene, const VoxelFrame& frame, const std::vector<Coord>& voxels);
+/// Share of rays from the free points of a scene with truth that meet none of `voxels` before they
+/// have passed the true surface by two voxels.
+double sceneLeak(const EvaluationScene& scene, const VoxelFrame& frame,
+                 const std::vector<Coord>& voxels);
 
 /// Adds an opaque-looking Gaussian of one colour: standard deviation sigma_m in all directions.
-void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vector3f& srgb, Gaussians* g);
+void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vector3f& srgb,
+                  Gaussians* g);
 
-/// An opaque isotropic Gaussian at each pixel with a nonzero `observed` ([H * W] of each view), at its depth,
-/// as wide as its pixel. World frame.
-Gaussians pixelAligned(const std::vector<View>& views, const std::vector<std::vector<uint8_t>>& observed);
+/// An opaque isotropic Gaussian at each pixel with a nonzero `observed` ([H * W] of each view), at
+/// its depth, as wide as its pixel. World frame.
+Gaussians pixelAligned(const std::vector<View>& views,
+                       const std::vector<std::vector<uint8_t>>& observed);
 
-/// Writes pictures as a PNG: a column a method, a row a view, all in the size of the first. Throws Error.
+/// Writes pictures as a PNG: a column a method, a row a view, all in the size of the first. Throws
+/// Error.
 void writeColumns(const std::vector<std::vector<Image>>& columns, const std::string& path);
 
 /// The user's own networks; null where there is none.
@@ -87,21 +96,23 @@ struct MethodResult {
   int views = 0;
   double psnr = 0, ssim = 0, flip = 0;  // mean over target views
   double lpips = 0;                     // the same, by the user's network; NaN without one
-  // Median depth against the targets' depth, where both are: mean over target views of the median of
-  // the absolute difference and of the root mean square, metres.
+  // Median depth against the targets' depth, where both are: mean over target views of the median
+  // of the absolute difference and of the root mean square, metres.
   double depth_median_m = 0, depth_rmse_m = 0;
-  double depth_share = 0;               // of the targets' depths: those with a median depth to compare
+  double depth_share = 0;  // of the targets' depths: those with a median depth to compare
   // Between the target pictures of all scenes and what was rendered for them: in the mean only, NaN
   // elsewhere and without a network.
-  double fid = std::numeric_limits<double>::quiet_NaN(), kid = std::numeric_limits<double>::quiet_NaN();
+  double fid = std::numeric_limits<double>::quiet_NaN(),
+         kid = std::numeric_limits<double>::quiet_NaN();
   std::vector<std::vector<float>> features, true_features;  // one row a target view
-  // 0.2 m nodes that were unobserved, against the true surface; recall also of those that the room's shell
-  // passes and of the others, which only furniture passes. outside: outsideCount() of the filled ones.
+  // 0.2 m nodes that were unobserved, against the true surface; recall also of those that the
+  // room's shell passes and of the others, which only furniture passes. outside: outsideCount() of
+  // the filled ones.
   double precision = 0, recall = 0, f1 = 0, iou = 0;
   double shell_recall = 0, furniture_recall = 0, outside = 0;
   double ece = std::numeric_limits<double>::quiet_NaN();  // calibrationError(); of `completed` only
-  std::optional<Reliability> reliability;                 // the same; of a mean the sums over its scenes
-  double leak = 0;                  // share of rays from free space that pass the true surface
+  std::optional<Reliability> reliability;  // the same; of a mean the sums over its scenes
+  double leak = 0;  // share of rays from free space that pass the true surface
   double seconds = 0, peak_rss_mb = 0;
   int64_t gaussians = 0;
 };
@@ -110,17 +121,19 @@ std::string resultJson(const MethodResult& result);
 /// One JSON object: scene, views, method and, a bin, [count, sum of probabilities, hits].
 std::string reliabilityJson(const MethodResult& result);
 
-/// Methods: observed, pixel-aligned, nearest, box, completed, oracle-occupancy (rooms only), and completed-tau-T for each
-/// T of `taus`. With a `picture` writes a PNG: of at most four target views the truth, then a column a method but
-/// pixel-aligned, which looks like observed.
+/// Methods: observed, pixel-aligned, nearest, box, completed, oracle-occupancy (rooms only), and
+/// completed-tau-T for each T of `taus`. With a `picture` writes a PNG: of at most four target
+/// views the truth, then a column a method but pixel-aligned, which looks like observed.
 std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Encoder& encoder,
                                         const Completer& completer, const SceneSettings& settings,
                                         const std::vector<double>& taus, const std::string& picture,
                                         Progress& progress, const UserNets& nets = {});
 
-/// Mean over scenes of each method, scene "mean"; values that are NaN in a scene are left out there.
+/// Mean over scenes of each method, scene "mean"; values that are NaN in a scene are left out
+/// there.
 std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results);
-/// Sample standard deviation over scenes of each method, scene "std"; NaN with fewer than two values.
+/// Sample standard deviation over scenes of each method, scene "std"; NaN with fewer than two
+/// values.
 std::vector<MethodResult> deviationResults(const std::vector<MethodResult>& results);
 
 }  // namespace vdbc

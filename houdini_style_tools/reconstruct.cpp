@@ -29,7 +29,8 @@ struct JudgedViews {
   std::vector<Mask> observed;
 };
 
-JudgedViews judged(std::vector<View> views, const Observation& o, int level, const CarveSettings& carving) {
+JudgedViews judged(std::vector<View> views, const Observation& o, int level,
+                   const CarveSettings& carving) {
   JudgedViews j{std::move(views), {}};
   for (const View& v : j.views) j.observed.push_back(observedPixels(v, o, level, carving));
   return j;
@@ -77,21 +78,29 @@ void copyBack(const Tensor& from, std::vector<T>* to) {
 }
 
 const std::vector<Score<ReconstructionResult>> kScores = {
-    {"input_psnr", &ReconstructionResult::input_psnr}, {"input_ssim", &ReconstructionResult::input_ssim},
-    {"input_flip", &ReconstructionResult::input_flip}, {"other_psnr", &ReconstructionResult::other_psnr},
-    {"other_ssim", &ReconstructionResult::other_ssim}, {"other_flip", &ReconstructionResult::other_flip},
+    {"input_psnr", &ReconstructionResult::input_psnr},
+    {"input_ssim", &ReconstructionResult::input_ssim},
+    {"input_flip", &ReconstructionResult::input_flip},
+    {"other_psnr", &ReconstructionResult::other_psnr},
+    {"other_ssim", &ReconstructionResult::other_ssim},
+    {"other_flip", &ReconstructionResult::other_flip},
     {"voxel_precision", &ReconstructionResult::voxel_precision},
-    {"voxel_recall", &ReconstructionResult::voxel_recall}, {"voxel_f1", &ReconstructionResult::voxel_f1},
+    {"voxel_recall", &ReconstructionResult::voxel_recall},
+    {"voxel_f1", &ReconstructionResult::voxel_f1},
     {"node_precision", &ReconstructionResult::node_precision},
-    {"node_recall", &ReconstructionResult::node_recall}, {"node_f1", &ReconstructionResult::node_f1},
-    {"leak", &ReconstructionResult::leak}, {"encode_seconds", &ReconstructionResult::encode_seconds},
-    {"decode_seconds", &ReconstructionResult::decode_seconds}, {"peak_rss_mb", &ReconstructionResult::peak_rss_mb}};
+    {"node_recall", &ReconstructionResult::node_recall},
+    {"node_f1", &ReconstructionResult::node_f1},
+    {"leak", &ReconstructionResult::leak},
+    {"encode_seconds", &ReconstructionResult::encode_seconds},
+    {"decode_seconds", &ReconstructionResult::decode_seconds},
+    {"peak_rss_mb", &ReconstructionResult::peak_rss_mb}};
 
 }  // namespace
 
 std::string reconstructionJson(const ReconstructionResult& r) { return scoresJson(r, kScores); }
 
-std::vector<ReconstructionResult> meanReconstructions(const std::vector<ReconstructionResult>& results) {
+std::vector<ReconstructionResult> meanReconstructions(
+    const std::vector<ReconstructionResult>& results) {
   return summaries(results, kScores, "mean", meanOf);
 }
 
@@ -105,27 +114,31 @@ Gaussians voxelMean(const Observation& o, int per_voxel) {
     const float* features = &o.voxel_features[size_t(v) * kVoxelFeatures];
     const Eigen::Vector3f srgb(features[32], features[33], features[34]);
     for (int i = 0; i < per_voxel; ++i)
-      addIsotropic(o.frame.toWorld(Eigen::Vector3d(ijk.x(), ijk.y(), ijk.z()) + place.col(i).cast<double>()), sigma_m,
-                   srgb, &g);
+      addIsotropic(
+          o.frame.toWorld(Eigen::Vector3d(ijk.x(), ijk.y(), ijk.z()) + place.col(i).cast<double>()),
+          sigma_m, srgb, &g);
   }
   return g;
 }
 
-Gaussians optimised(const Gaussians& start, const std::vector<View>& views, const std::vector<Mask>& observed,
-                    const OptimiseSettings& s, Progress& progress) {
+Gaussians optimised(const Gaussians& start, const std::vector<View>& views,
+                    const std::vector<Mask>& observed, const OptimiseSettings& s,
+                    Progress& progress) {
   const auto started = Clock::now();
   const int64_t n = start.size();
   Tensor mean = parameterOf(start.mean, {n, 3}), log_scale = parameterOf(start.log_scale, {n, 3});
-  Tensor rotation = parameterOf(start.rotation, {n, 4}), opacity = parameterOf(start.opacity_logit, {n});
+  Tensor rotation = parameterOf(start.rotation, {n, 4}),
+         opacity = parameterOf(start.opacity_logit, {n});
   Tensor sh = parameterOf(start.sh, {n, start.shCoefficients(), 3});
   std::vector<torch::optim::OptimizerParamGroup> groups;
   auto add = [&](const Tensor& parameter, double rate) {
-    groups.emplace_back(std::vector<Tensor>{parameter},
-                        std::make_unique<torch::optim::AdamOptions>(torch::optim::AdamOptions(rate).eps(1e-15)));
+    groups.emplace_back(
+        std::vector<Tensor>{parameter},
+        std::make_unique<torch::optim::AdamOptions>(torch::optim::AdamOptions(rate).eps(1e-15)));
   };
-  // In the proportions of 3-D Gaussian splatting (Kerbl et al. 2023), about four times as fast (opacity: as fast): half a minute on
-  // two cores is a few hundred steps. Of factors .3, 1 and 2, and of means at 1, 2 and 3 mm, these did best on
-  // validation rooms 900000 and 900001.
+  // In the proportions of 3-D Gaussian splatting (Kerbl et al. 2023), about four times as fast
+  // (opacity: as fast): half a minute on two cores is a few hundred steps. Of factors .3, 1 and 2,
+  // and of means at 1, 2 and 3 mm, these did best on validation rooms 900000 and 900001.
   add(mean, 2e-3), add(log_scale, 2e-2), add(rotation, 4e-3), add(opacity, 5e-2), add(sh, 1e-2);
   torch::optim::Adam adam(groups, torch::optim::AdamOptions());
 
@@ -141,11 +154,14 @@ Gaussians optimised(const Gaussians& start, const std::vector<View>& views, cons
   for (int64_t step = 0; step < s.max_steps && secondsSince(started) < s.seconds; ++step) {
     const size_t i = random() % views.size();
     const Tensor image =
-        rasterizeTorch(mean, log_scale, rotation, opacity, sh, views[i].camera, raster).slice(2, 0, 3);
+        rasterizeTorch(mean, log_scale, rotation, opacity, sh, views[i].camera, raster)
+            .slice(2, 0, 3);
     adam.zero_grad();
-    (((image - colours[i]).square() * masks[i]).sum() / (3 * masks[i].sum()).clamp_min(1)).backward();
+    (((image - colours[i]).square() * masks[i]).sum() / (3 * masks[i].sum()).clamp_min(1))
+        .backward();
     adam.step();
-    report(progress, int(100 * std::max(double(step) / double(s.max_steps), secondsSince(started) / s.seconds)));
+    report(progress, int(100 * std::max(double(step) / double(s.max_steps),
+                                        secondsSince(started) / s.seconds)));
   }
   Gaussians g = start;
   copyBack(mean, &g.mean), copyBack(log_scale, &g.log_scale), copyBack(rotation, &g.rotation);
@@ -153,11 +169,13 @@ Gaussians optimised(const Gaussians& start, const std::vector<View>& views, cons
   return g;
 }
 
-SetScores splitScores(const TriangleMesh& truth, const Observation& o, const std::vector<Coord>& voxels, int level) {
+SetScores splitScores(const TriangleMesh& truth, const Observation& o,
+                      const std::vector<Coord>& voxels, int level) {
   openvdb::tree::ValueAccessor<const TokenMask> empty(o.space.empty);
   const int side = 1 << level;
   const auto unseen = [&](const Coord& child) {
-    if (o.tokens.row(level + 1, tokenCoord(child, 1)) < 0 || o.tokens.row(level, child) >= 0) return false;
+    if (o.tokens.row(level + 1, tokenCoord(child, 1)) < 0 || o.tokens.row(level, child) >= 0)
+      return false;
     for (int v = 0; v < side * side * side; ++v)
       if (!empty.isValueOn(voxelOf(child, side, v))) return true;
     return false;
@@ -170,9 +188,9 @@ SetScores splitScores(const TriangleMesh& truth, const Observation& o, const std
   return setScores(filled, surface);
 }
 
-std::vector<ReconstructionResult> evaluateReconstruction(const EvaluationScene& scene, const Encoder& encoder,
-                                                         const SceneSettings& settings, double optimise_seconds,
-                                                         const std::string& picture, Progress& progress) {
+std::vector<ReconstructionResult> evaluateReconstruction(
+    const EvaluationScene& scene, const Encoder& encoder, const SceneSettings& settings,
+    double optimise_seconds, const std::string& picture, Progress& progress) {
   SceneSettings s = settings;
   s.volume.up = scene.up;
   const int level = encoder.config().levels;
@@ -196,17 +214,21 @@ std::vector<ReconstructionResult> evaluateReconstruction(const EvaluationScene& 
   std::vector<ReconstructionResult> results;
   std::vector<std::vector<Image>> columns(1);
   for (const JudgedViews* j : {&input, &others})
-    for (size_t i = 0; i < std::min(kShownViews, j->views.size()); ++i) columns[0].push_back(j->views[i].colour);
-  auto measure = [&](const char* method, const Gaussians& gaussians, double seconds) -> ReconstructionResult& {
+    for (size_t i = 0; i < std::min(kShownViews, j->views.size()); ++i)
+      columns[0].push_back(j->views[i].colour);
+  auto measure = [&](const char* method, const Gaussians& gaussians,
+                     double seconds) -> ReconstructionResult& {
     ReconstructionResult r;
     r.peak_rss_mb = peakMemoryMb();  // before it is looked at
-    r.scene = scene.name, r.method = method, r.views = int(scene.input.size()), r.gaussians = gaussians.size();
+    r.scene = scene.name, r.method = method, r.views = int(scene.input.size()),
+    r.gaussians = gaussians.size();
     columns.emplace_back();
     const PictureError a = meanError(input, gaussians, kShownViews, &columns.back());
     const PictureError b = meanError(others, gaussians, kShownViews, &columns.back());
     r.input_psnr = a.psnr, r.input_ssim = a.ssim, r.input_flip = a.flip;
     r.other_psnr = b.psnr, r.other_ssim = b.ssim, r.other_flip = b.flip;
-    r.voxel_precision = r.voxel_recall = r.voxel_f1 = r.node_precision = r.node_recall = r.node_f1 = kNan;
+    r.voxel_precision = r.voxel_recall = r.voxel_f1 = r.node_precision = r.node_recall = r.node_f1 =
+        kNan;
     r.leak = r.decode_seconds = kNan;
     r.encode_seconds = seconds;
     results.push_back(r);
@@ -220,17 +242,20 @@ std::vector<ReconstructionResult> evaluateReconstruction(const EvaluationScene& 
   if (scene.truth) {
     if (level > 0) {
       const SetScores split = splitScores(*scene.truth, o, decoded.voxels, 0);
-      ours.voxel_precision = split.precision, ours.voxel_recall = split.recall, ours.voxel_f1 = split.f1;
+      ours.voxel_precision = split.precision, ours.voxel_recall = split.recall,
+      ours.voxel_f1 = split.f1;
     }
     if (level > 1) {
       const SetScores split = splitScores(*scene.truth, o, decoded.voxels, 1);
-      ours.node_precision = split.precision, ours.node_recall = split.recall, ours.node_f1 = split.f1;
+      ours.node_precision = split.precision, ours.node_recall = split.recall,
+      ours.node_f1 = split.f1;
     }
     ours.leak = sceneLeak(scene, o.frame, decoded.voxels);
     start = Clock::now();
   }
   const Gaussians means = voxelMean(o, encoder.config().gaussians_per_voxel);
-  ReconstructionResult& voxel_mean = measure("voxel-mean", means, observe_seconds + secondsSince(start));
+  ReconstructionResult& voxel_mean =
+      measure("voxel-mean", means, observe_seconds + secondsSince(start));
   if (scene.truth) voxel_mean.leak = sceneLeak(scene, o.frame, o.tokens.coords(0));
   start = Clock::now();
   {

@@ -25,14 +25,14 @@ std::vector<View> trainingViews(uint64_t seed, const std::string& cache_folder) 
   const std::string folder = cache_folder + "/" + std::to_string(seed);
   if (!cache_folder.empty() && fs::exists(folder + "/transforms.json")) {
     std::vector<View> views = readViews(folder);
-    require(int(views.size()) >= kRoomViews, folder, ": expected ", kRoomViews, " views or more, found ",
-            views.size());
+    require(int(views.size()) >= kRoomViews, folder, ": expected ", kRoomViews,
+            " views or more, found ", views.size());
     views.resize(size_t(kRoomViews));
     return views;
   }
   const Room room = makeRoom(roomAssets(), seed);
-  std::vector<View> views = roomViews(room, RoomRenderer(room), kRoomViews, kRoomSide, kRoomSide,
-                                      kRoomSamples, seed);
+  std::vector<View> views =
+      roomViews(room, RoomRenderer(room), kRoomViews, kRoomSide, kRoomSide, kRoomSamples, seed);
   if (!cache_folder.empty()) writeViews(views, folder);
   return views;
 }
@@ -48,7 +48,8 @@ VoxelFrame completionFrame(const std::vector<View>& views, const EncoderConfig& 
 }
 
 CompletionSample completionSample(const Encoder& encoder, uint64_t seed, int choice,
-                                  const std::string& cache_folder, const std::string& sample_folder) {
+                                  const std::string& cache_folder,
+                                  const std::string& sample_folder) {
   const std::string path = joinText(sample_folder, "/", seed, ".", choice, ".sample");
   if (fs::exists(path)) return readSample(path);
   std::vector<View> views = trainingViews(seed, cache_folder);
@@ -66,8 +67,10 @@ CompletionSample completionSample(const Encoder& encoder, uint64_t seed, int cho
   CompletionSample s;
   s.condition = encoder.encode(few, sparse, silent);
   s.target = encoder.encode(views, dense, silent);
-  s.seen_nodes = poolStates(frame, sparse.space, 1), s.seen_coarse = poolStates(frame, sparse.space, 2);
-  s.target_nodes = poolStates(frame, dense.space, 1), s.target_coarse = poolStates(frame, dense.space, 2);
+  s.seen_nodes = poolStates(frame, sparse.space, 1),
+  s.seen_coarse = poolStates(frame, sparse.space, 2);
+  s.target_nodes = poolStates(frame, dense.space, 1),
+  s.target_coarse = poolStates(frame, dense.space, 2);
   fs::create_directories(sample_folder);
   writeSample(s, path);
   return s;

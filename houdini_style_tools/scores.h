@@ -29,14 +29,16 @@ template <typename Result>
 std::string scoresJson(const Result& r, const std::vector<Score<Result>>& scores) {
   nlohmann::ordered_json j{{"scene", r.scene}, {"views", r.views}, {"method", r.method}};
   for (const auto& s : scores)
-    j[s.name] = std::isfinite(r.*s.value) ? nlohmann::ordered_json(r.*s.value) : nlohmann::ordered_json();
+    j[s.name] =
+        std::isfinite(r.*s.value) ? nlohmann::ordered_json(r.*s.value) : nlohmann::ordered_json();
   j["gaussians"] = r.gaussians;
   return j.dump();
 }
 
 /// NaN without values.
 inline double meanOf(const std::vector<double>& values) {
-  return values.empty() ? kNan : std::accumulate(values.begin(), values.end(), 0.) / double(values.size());
+  return values.empty() ? kNan
+                        : std::accumulate(values.begin(), values.end(), 0.) / double(values.size());
 }
 /// Of the sample (n - 1); NaN with fewer than two values.
 inline double deviationOf(const std::vector<double>& values) {
@@ -47,11 +49,12 @@ inline double deviationOf(const std::vector<double>& values) {
   return std::sqrt(sum / double(values.size() - 1));
 }
 
-/// A result of each method, in the order they appear, named `scene`: each number is `summary` of its values over
-/// the scenes. Values that are NaN in a scene are left out there.
+/// A result of each method, in the order they appear, named `scene`: each number is `summary` of
+/// its values over the scenes. Values that are NaN in a scene are left out there.
 template <typename Result>
-std::vector<Result> summaries(const std::vector<Result>& results, const std::vector<Score<Result>>& scores,
-                              const char* scene, double summary(const std::vector<double>&)) {
+std::vector<Result> summaries(const std::vector<Result>& results,
+                              const std::vector<Score<Result>>& scores, const char* scene,
+                              double summary(const std::vector<double>&)) {
   std::vector<Result> all;
   for (const Result& first : results) {
     const auto same = [&](const Result& r) { return r.method == first.method; };

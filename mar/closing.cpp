@@ -22,7 +22,8 @@ struct Place {
 using Graph = boost::adjacency_list<boost::vecS, boost::vecS, boost::directedS, Place, Pipe>;
 
 void connect(Graph& graph, size_t from, size_t to, double capacity) {
-  const Edge there = boost::add_edge(from, to, graph).first, here = boost::add_edge(to, from, graph).first;
+  const Edge there = boost::add_edge(from, to, graph).first,
+             here = boost::add_edge(to, from, graph).first;
   graph[there].capacity = capacity, graph[there].reverse = here;
   graph[here].reverse = there;
 }
@@ -35,15 +36,18 @@ std::vector<Coord> closingTokens(const NodeStates& nodes, const std::vector<Coor
   constexpr int32_t kSource = 0, kSink = 1, kSolid = -1, kUnlabelled = -2;
   const double never = -std::log(kUncertain) * double(dropped.size() + 1);
   const size_t n = nodes.states.size();
-  std::vector<int32_t> vertex(n, kUnlabelled);  // in the graph; of a dropped token its way in, the way out is next
+  std::vector<int32_t> vertex(
+      n, kUnlabelled);  // in the graph; of a dropped token its way in, the way out is next
   for (size_t i = 0; i < n; ++i)
-    if (nodes.states[i] != NodeState::kUnobserved) vertex[i] = nodes.states[i] == NodeState::kFilled ? kSolid : kSource;
+    if (nodes.states[i] != NodeState::kUnobserved)
+      vertex[i] = nodes.states[i] == NodeState::kFilled ? kSolid : kSource;
   for (const Coord& c : occupied)
     if (nodes.box.isInside(c)) vertex[size_t(nodes.index(c))] = kSolid;
   int32_t vertices = 2;
   std::vector<std::pair<Coord, float>> pipes;
   for (const auto& token : dropped) {
-    if (!nodes.box.isInside(token.first) || vertex[size_t(nodes.index(token.first))] != kUnlabelled) continue;
+    if (!nodes.box.isInside(token.first) || vertex[size_t(nodes.index(token.first))] != kUnlabelled)
+      continue;
     vertex[size_t(nodes.index(token.first))] = vertices, vertices += 2;
     pipes.push_back(token);
   }
@@ -84,7 +88,8 @@ std::vector<Coord> closingTokens(const NodeStates& nodes, const std::vector<Coor
   Graph graph(static_cast<size_t>(vertices));
   for (const auto& [c, probability] : pipes) {
     const int32_t in = vertex[size_t(nodes.index(c))], out = in + 1;
-    connect(graph, size_t(in), size_t(out), -std::log(std::clamp(double(probability), kUncertain, 1.)));
+    connect(graph, size_t(in), size_t(out),
+            -std::log(std::clamp(double(probability), kUncertain, 1.)));
     if (isBorder(c)) connect(graph, size_t(out), kSink, never);
     forNeighbours(c, [&](const Coord& next) {
       const int32_t other = vertex[size_t(nodes.index(next))];
@@ -100,13 +105,16 @@ std::vector<Coord> closingTokens(const NodeStates& nodes, const std::vector<Coor
     const int32_t own = vertex[size_t(nodes.index(*node))];
     if (own < first_region) continue;
     bool open = false;
-    forNeighbours(*node, [&](const Coord& next) { open = open || vertex[size_t(nodes.index(next))] == kSource; });
+    forNeighbours(*node, [&](const Coord& next) {
+      open = open || vertex[size_t(nodes.index(next))] == kSource;
+    });
     if (open) connect(graph, kSource, size_t(own), never);
   }
-  boost::boykov_kolmogorov_max_flow(graph, boost::get(&Pipe::capacity, graph), boost::get(&Pipe::residual, graph),
-                                    boost::get(&Pipe::reverse, graph), boost::get(&Place::predecessor, graph),
-                                    boost::get(&Place::colour, graph), boost::get(&Place::distance, graph),
-                                    boost::get(boost::vertex_index, graph), size_t(kSource), size_t(kSink));
+  boost::boykov_kolmogorov_max_flow(
+      graph, boost::get(&Pipe::capacity, graph), boost::get(&Pipe::residual, graph),
+      boost::get(&Pipe::reverse, graph), boost::get(&Place::predecessor, graph),
+      boost::get(&Place::colour, graph), boost::get(&Place::distance, graph),
+      boost::get(boost::vertex_index, graph), size_t(kSource), size_t(kSink));
   std::vector<Coord> closing;
   const auto source_colour = graph[kSource].colour;
   for (const auto& [c, probability] : pipes) {

@@ -43,7 +43,8 @@ void visitFields(Config& c, Visit&& visit) {
   visit("chunk_tokens", c.chunk_tokens), visit("coarse_empty_tokens", c.coarse_empty_tokens);
   visit("coarse_chunk_tokens", c.coarse_chunk_tokens);
   visit("coarse_stage", c.coarse_stage);
-  visit("context_noise", c.context_noise), visit("context_false_positives", c.context_false_positives);
+  visit("context_noise", c.context_noise),
+      visit("context_false_positives", c.context_false_positives);
   visit("focal_gamma", c.focal_gamma), visit("focal_alpha", c.focal_alpha);
   visit("unobserved_weight", c.unobserved_weight);
 }
@@ -67,18 +68,23 @@ CompleterConfig CompleterConfig::fromJson(const std::string& text, const std::st
     require(value >= low && value <= high, "CompleterConfig: ", where, ": expected ", name, " in [",
             low, ", ", high, "], found ", value);
   };
-  within("latent_dim", c.latent_dim, 1, 1024), within("latent_groups", c.latent_groups, 0, c.latent_dim), within("width", c.width, 1, 4096);
+  within("latent_dim", c.latent_dim, 1, 1024),
+      within("latent_groups", c.latent_groups, 0, c.latent_dim), within("width", c.width, 1, 4096);
   within("heads", c.heads, 1, 64), within("layers", c.layers, 1, 64);
   within("coarse_width", c.coarse_width, 1, 4096), within("coarse_heads", c.coarse_heads, 1, 64);
   within("coarse_layers", c.coarse_layers, 1, 64);
   within("diffusion_width", c.diffusion_width, 1, 4096);
-  within("diffusion_steps", c.diffusion_steps, 2, 100000), within("diffusion_draws", c.diffusion_draws, 0, 1024);
+  within("diffusion_steps", c.diffusion_steps, 2, 100000),
+      within("diffusion_draws", c.diffusion_draws, 0, 1024);
   within("context_tokens", c.context_tokens, 1, 1 << 20);
-  within("empty_tokens", c.empty_tokens, 0, 1 << 20), within("chunk_tokens", c.chunk_tokens, 1, 1 << 20);
+  within("empty_tokens", c.empty_tokens, 0, 1 << 20),
+      within("chunk_tokens", c.chunk_tokens, 1, 1 << 20);
   within("coarse_empty_tokens", c.coarse_empty_tokens, 0, 1 << 20);
   within("coarse_chunk_tokens", c.coarse_chunk_tokens, 1, 1 << 20);
-  require((c.latent_groups == 0 || c.latent_dim % c.latent_groups == 0) && c.width % (2 * c.heads) == 0 && c.coarse_width % (2 * c.coarse_heads) == 0,
-          "CompleterConfig: ", where, ": widths are not multiples of twice their heads, or the latents of their groups");
+  require((c.latent_groups == 0 || c.latent_dim % c.latent_groups == 0) &&
+              c.width % (2 * c.heads) == 0 && c.coarse_width % (2 * c.coarse_heads) == 0,
+          "CompleterConfig: ", where,
+          ": widths are not multiples of twice their heads, or the latents of their groups");
   return c;
 }
 
@@ -113,9 +119,13 @@ struct Completer::Impl {
     }
   };
 
-  // Standardised predictions as a file will hold them: a run that goes on from one sees the same numbers.
+  // Standardised predictions as a file will hold them: a run that goes on from one sees the same
+  // numbers.
   Tensor asFiled(const Tensor& z, bool project) const {
-    return net->restore(project ? net->project(z) : z).to(torch::kHalf).to(torch::kFloat32).contiguous();
+    return net->restore(project ? net->project(z) : z)
+        .to(torch::kHalf)
+        .to(torch::kFloat32)
+        .contiguous();
   }
 
   // The growing grid, observed rows first; `z` [N, D] has its latents standardised.
@@ -130,7 +140,8 @@ struct Completer::Impl {
       const Tensor latents = torch::cat(t.z).contiguous();
       z = torch::cat({z, net.standardise(latents)});
       grid.ijk.insert(grid.ijk.end(), t.ijk.begin(), t.ijk.end());
-      grid.z.insert(grid.z.end(), latents.data_ptr<float>(), latents.data_ptr<float>() + latents.numel());
+      grid.z.insert(grid.z.end(), latents.data_ptr<float>(),
+                    latents.data_ptr<float>() + latents.numel());
       grid.observed.resize(grid.ijk.size(), 0);
       grid.probability.insert(grid.probability.end(), t.probability.begin(), t.probability.end());
       grid.bfs_level.insert(grid.bfs_level.end(), t.level.begin(), t.level.end());
@@ -147,11 +158,14 @@ struct Completer::Impl {
     require(std::is_sorted(start.observed.rbegin(), start.observed.rend()),
             "Completer: the latent grid: expected observed tokens before generated ones");
     const Tensor z = torch::tensor(start.z).view({start.size(), d});
-    auto stays = [&](size_t i) { return !s.resumed || start.observed[i] || start.probability[i] > s.tau; };
+    auto stays = [&](size_t i) {
+      return !s.resumed || start.observed[i] || start.probability[i] > s.tau;
+    };
     std::vector<int64_t> rows[2];
     for (int64_t i = 0; i < start.size(); ++i) rows[stays(size_t(i))].push_back(i);
     dropped->add({start.ijk, start.probability, start.bfs_level, {z}}, rows[0]);
-    return {keepTokens(start, stays), net->standardise(z.index_select(0, torch::tensor(rows[1]))), observed};
+    return {keepTokens(start, stays), net->standardise(z.index_select(0, torch::tensor(rows[1]))),
+            observed};
   }
 
   // A part of the volume that the networks look at as one: what it decides, and the frame with its
@@ -168,9 +182,11 @@ struct Completer::Impl {
     for (int axis = 0; axis < 3; ++axis) {
       const int begin = whole.bounds.min()[axis], side = whole.bounds.dim()[axis];
       const double side_m = side * double(whole.voxel_m);
-      const int parts = side_m <= kWindowM ? 1 : int(std::ceil(side_m / (kWindowM - 2 * kOverlapM)));
+      const int parts =
+          side_m <= kWindowM ? 1 : int(std::ceil(side_m / (kWindowM - 2 * kOverlapM)));
       for (int part = 0; part < parts; ++part)
-        cuts[size_t(axis)].push_back(part ? (begin + int(int64_t(side) * part / parts)) & ~3 : begin);
+        cuts[size_t(axis)].push_back(part ? (begin + int(int64_t(side) * part / parts)) & ~3
+                                          : begin);
       cuts[size_t(axis)].push_back(begin + side);
     }
     std::vector<Window> windows;
@@ -178,7 +194,8 @@ struct Completer::Impl {
       for (size_t y = 0; y + 1 < cuts[1].size(); ++y)
         for (size_t z = 0; z + 1 < cuts[2].size(); ++z) {
           Window w{CoordBBox(Coord(cuts[0][x], cuts[1][y], cuts[2][z]),
-                             Coord(cuts[0][x + 1] - 1, cuts[1][y + 1] - 1, cuts[2][z + 1] - 1)), whole};
+                             Coord(cuts[0][x + 1] - 1, cuts[1][y + 1] - 1, cuts[2][z + 1] - 1)),
+                   whole};
           w.frame.bounds = w.core;
           w.frame.bounds.expand(overlap);
           w.frame.bounds.intersect(whole.bounds);
@@ -187,7 +204,8 @@ struct Completer::Impl {
     return windows;
   }
 
-  // What is known, and the coarse stage's probability of every coarse node with unseen content (1 where filled).
+  // What is known, and the coarse stage's probability of every coarse node with unseen content (1
+  // where filled).
   struct Scene {
     SceneTokens tokens;
     std::vector<Window> windows;
@@ -200,14 +218,17 @@ struct Completer::Impl {
     }
   };
 
-  static std::vector<std::vector<Coord>> byWindow(const Scene& scene, const std::vector<Coord>& tokens) {
+  static std::vector<std::vector<Coord>> byWindow(const Scene& scene,
+                                                  const std::vector<Coord>& tokens) {
     std::vector<std::vector<Coord>> parts(scene.windows.size());
     for (const Coord& c : tokens) parts[scene.windowOf(c)].push_back(c);
     return parts;
   }
 
   static Scene sceneOf(const LatentGrid& start, const ObservedSpace& space) {
-    return {sceneTokens(poolStates(start.frame, space, 1), poolStates(start.frame, space, 2)), windowsOf(start.frame), {}};
+    return {sceneTokens(poolStates(start.frame, space, 1), poolStates(start.frame, space, 2)),
+            windowsOf(start.frame),
+            {}};
   }
 
   void openGate(Scene* scene) const {
@@ -224,13 +245,14 @@ struct Completer::Impl {
   }
 
   // One chunk: targets that lie close together, with what is nearest to them as context.
-  Tokens predict(const Growth& g, const Scene& scene, const std::vector<Coord>& targets, int32_t level,
-                 const CompleteSettings& s, torch::Generator& random) const {
+  Tokens predict(const Growth& g, const Scene& scene, const std::vector<Coord>& targets,
+                 int32_t level, const CompleteSettings& s, torch::Generator& random) const {
     const Eigen::Vector3d centre = centreOf(targets);
     std::array<TokenSet, kTokenKinds> in;
     std::vector<int64_t> rows[2];
     const std::vector<Coord>& context = s.generated_context ? g.grid.ijk : g.observed;
-    for (int64_t row : nearestRows(context, centre, s.context_tokens ? s.context_tokens : net->config.context_tokens)) {
+    for (int64_t row : nearestRows(
+             context, centre, s.context_tokens ? s.context_tokens : net->config.context_tokens)) {
       const int kind = row >= g.seeds();
       rows[kind].push_back(row);
       in[size_t(kind)].coords.push_back(context[size_t(row)]);
@@ -245,39 +267,46 @@ struct Completer::Impl {
       parent_probability.push_back(found == scene.gate.end() ? 0.f : found->second);
     }
     in[kTarget].features = torch::tensor(parent_probability).unsqueeze(1);
-    const CompleterNet::Fine f = net->fine(in, scene.windows[scene.windowOf(in[kTarget].coords[0])].frame);
+    const CompleterNet::Fine f =
+        net->fine(in, scene.windows[scene.windowOf(in[kTarget].coords[0])].frame);
     const Tensor p = f.logits.sigmoid().contiguous();
     return {targets,
             {p.data_ptr<float>(), p.data_ptr<float>() + p.numel()},
             std::vector<int32_t>(targets.size(), level),
-            {asFiled(net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random), s.generated_context)}};
+            {asFiled(net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random),
+                     s.generated_context)}};
   }
 
-  // Visits candidates level by level; keeps those that `keep` accepts given their probability, the others
-  // are added to `dropped`. Levels are distances from what was observed, whatever of them is done already or may
-  // not be generated.
+  // Visits candidates level by level; keeps those that `keep` accepts given their probability, the
+  // others are added to `dropped`. Levels are distances from what was observed, whatever of them is
+  // done already or may not be generated.
   template <typename Keep>
   void grow(Growth* g, Tokens* dropped, const Scene& scene, const std::vector<Coord>& candidates,
-            const CompleteSettings& s, Keep keep, Progress& progress, const LevelListener& listener) const {
+            const CompleteSettings& s, Keep keep, Progress& progress,
+            const LevelListener& listener) const {
     const std::set<Coord> done(g->grid.ijk.begin() + g->seeds(), g->grid.ijk.end());
     std::vector<int32_t> levels = breadthFirstLevels(candidates, g->observed, s.neighbours);
     if (s.random_order) std::shuffle(levels.begin(), levels.end(), std::mt19937_64(s.seed));
     const int32_t last = levels.empty() ? 0 : *std::max_element(levels.begin(), levels.end());
     for (int32_t level = std::max(1, s.first_level); level <= last; ++level) {
       report(progress, int(100 * (level - 1) / last));
-      // A generator a level: a run that goes on from a level draws what the whole one would have drawn.
+      // A generator a level: a run that goes on from a level draws what the whole one would have
+      // drawn.
       torch::Generator random = at::detail::createCPUGenerator(s.seed * 1000003 + uint64_t(level));
       std::vector<Coord> frontier;
       for (size_t i = 0; i < candidates.size(); ++i)
-        if (levels[i] == level && !done.count(candidates[i]) && (!s.region || s.region->isValueOn(candidates[i])))
+        if (levels[i] == level && !done.count(candidates[i]) &&
+            (!s.region || s.region->isValueOn(candidates[i])))
           frontier.push_back(candidates[i]);
       Tokens kept;
       for (const std::vector<Coord>& part : byWindow(scene, frontier))
-        for (const std::vector<Coord>& targets : chunksOf(part, s.chunk_tokens ? s.chunk_tokens : net->config.chunk_tokens)) {
+        for (const std::vector<Coord>& targets :
+             chunksOf(part, s.chunk_tokens ? s.chunk_tokens : net->config.chunk_tokens)) {
           report(progress, -1);
           const Tokens p = predict(*g, scene, targets, level, s, random);
           std::vector<int64_t> rows[2];
-          for (size_t i = 0; i < targets.size(); ++i) rows[keep(p.probability[i])].push_back(int64_t(i));
+          for (size_t i = 0; i < targets.size(); ++i)
+            rows[keep(p.probability[i])].push_back(int64_t(i));
           dropped->add(p, rows[0]), kept.add(p, rows[1]);
         }
       if (kept.z.empty()) continue;
@@ -301,7 +330,8 @@ struct Completer::Impl {
     for (size_t i = 0; i < dropped.ijk.size(); ++i)
       probability[dropped.ijk[i]] = dropped.probability[i], row[dropped.ijk[i]] = int64_t(i);
     std::vector<int64_t> rows;
-    for (const Coord& c : closingTokens(scene.tokens.nodes, g->grid.ijk, probability, least)) rows.push_back(row.at(c));
+    for (const Coord& c : closingTokens(scene.tokens.nodes, g->grid.ijk, probability, least))
+      rows.push_back(row.at(c));
     if (rows.empty()) return;
     Tokens closing;
     closing.add(dropped, rows);
@@ -320,7 +350,8 @@ struct Completer::Impl {
       for (const std::vector<Coord>& tokens : chunksOf(part, net->config.chunk_tokens)) {
         const Eigen::Vector3d centre = centreOf(tokens);
         std::array<TokenSet, kTokenKinds> in;
-        std::vector<int64_t> rows, near = nearestRows(generated, centre, net->config.context_tokens);
+        std::vector<int64_t> rows,
+            near = nearestRows(generated, centre, net->config.context_tokens);
         for (const Coord& c : tokens) rows.push_back(row_of.at(c));
         for (int64_t& row : near) {
           in[kVisible].coords.push_back(generated[size_t(row)]);
@@ -328,11 +359,13 @@ struct Completer::Impl {
         }
         in[kCondition] = {g->z.index_select(0, torch::tensor(rows)), tokens};
         in[kVisible].features = g->z.index_select(0, torch::tensor(near, torch::kInt64));
-        in[kEmptyToken].coords = nearestOf(scene.tokens.empty_shell, centre, net->config.empty_tokens);
+        in[kEmptyToken].coords =
+            nearestOf(scene.tokens.empty_shell, centre, net->config.empty_tokens);
         in[kTarget].features = torch::zeros({0, 1});
         const CompleterNet::Fine f = net->fine(in, scene.windows[scene.windowOf(tokens[0])].frame);
         refined.index_copy_(0, torch::tensor(rows),
-                            net->project(net->refinement->sample(f.conditions, s.sampling_steps, s.temperature, random)));
+                            net->project(net->refinement->sample(f.conditions, s.sampling_steps,
+                                                                 s.temperature, random)));
       }
     const Tensor z = net->restore(refined).to(torch::kHalf).to(torch::kFloat32).contiguous();
     std::copy_n(z.data_ptr<float>(), z.numel(), g->grid.z.begin());
@@ -358,8 +391,9 @@ const CompleterConfig& Completer::config() const { return impl_->net->config; }
 std::string Completer::hash() const { return impl_->hash; }
 std::string Completer::trainedOn() const { return impl_->trained_on; }
 
-LatentGrid Completer::complete(const LatentGrid& start, const ObservedSpace& space, const CompleteSettings& s,
-                               Progress& progress, const LevelListener& listener) const {
+LatentGrid Completer::complete(const LatentGrid& start, const ObservedSpace& space,
+                               const CompleteSettings& s, Progress& progress,
+                               const LevelListener& listener) const {
   torch::NoGradGuard no_grad;
   progress.start("complete");
   Impl::Tokens dropped;
@@ -369,8 +403,9 @@ LatentGrid Completer::complete(const LatentGrid& start, const ObservedSpace& spa
   std::vector<Coord> open;
   for (const auto& [node, probability] : scene.gate)
     if (probability > s.coarse_tau) open.push_back(node);
-  impl_->grow(&g, &dropped, scene, unobservedChildren(open, scene.tokens.nodes), s,
-              [&](float probability) { return probability > s.tau; }, progress, listener);
+  impl_->grow(
+      &g, &dropped, scene, unobservedChildren(open, scene.tokens.nodes), s,
+      [&](float probability) { return probability > s.tau; }, progress, listener);
   if (s.hole_tau < s.tau) impl_->closeHoles(&g, scene, dropped, s.hole_tau);
   if (s.refine_observed) impl_->refine(&g, scene, s);
   progress.end();
@@ -391,7 +426,8 @@ LatentGrid Completer::completeAt(const LatentGrid& seen, const ObservedSpace& sp
     candidates.push_back(c);
     scene.gate[tokenCoord(c, 1)] = 1;
   }
-  impl_->grow(&g, &dropped, scene, candidates, s, [](float) { return true; }, progress, nullptr);
+  impl_->grow(
+      &g, &dropped, scene, candidates, s, [](float) { return true; }, progress, nullptr);
   progress.end();
   return std::move(g.grid);
 }

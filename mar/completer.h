@@ -13,8 +13,8 @@ namespace vdbc {
 /// Every size of the completer; saved inside the weights file.
 struct CompleterConfig {
   std::string preset = "small";
-  int latent_dim = 64, latent_groups = 1;               // as the encoder's (spec E10)
-  int width = 128, heads = 4, layers = 3;               // fine stage; layers each in H1 and H2
+  int latent_dim = 64, latent_groups = 1;  // as the encoder's (spec E10)
+  int width = 128, heads = 4, layers = 3;  // fine stage; layers each in H1 and H2
   int coarse_width = 96, coarse_heads = 3, coarse_layers = 2;  // coarse stage, one tree level up
   int diffusion_width = 256, diffusion_steps = 1000, diffusion_draws = 2;
   bool paper_snr_weight = false;  // SNR / (1 + SNR) instead of min(1 / alpha_bar, 20)
@@ -27,7 +27,8 @@ struct CompleterConfig {
   // Loss.
   float focal_gamma = 0, focal_alpha = .5f;
   float unobserved_weight = .25f;  // of U, labelled empty; 0 masks U from the loss as in the paper
-  // Generated tokens in training's context, up to: deviation of noise on their latents, share of wrong ones.
+  // Generated tokens in training's context, up to: deviation of noise on their latents, share of
+  // wrong ones.
   float context_noise = .2f, context_false_positives = .06f;
 
   static CompleterConfig small() { return {}; }
@@ -37,18 +38,20 @@ struct CompleterConfig {
 };
 
 struct CompleteSettings {
-  float tau = .2f;           // a token is kept if its occupancy probability exceeds this
-  float coarse_tau = .1f;    // the coarse stage's gate: high recall
-  /// Dropped tokens above this probability are taken back where they close a hole (a minimum cut between
-  /// what was seen empty and the border of the volume); 1: none.
+  float tau = .2f;         // a token is kept if its occupancy probability exceeds this
+  float coarse_tau = .1f;  // the coarse stage's gate: high recall
+  /// Dropped tokens above this probability are taken back where they close a hole (a minimum cut
+  /// between what was seen empty and the border of the volume); 1: none.
   float hole_tau = .1f;
   Neighbours neighbours = Neighbours::kCorners26;
-  int sampling_steps = 0;    // DDIM steps of the diffusion head; 0: its linear mean
+  int sampling_steps = 0;  // DDIM steps of the diffusion head; 0: its linear mean
   double temperature = 1;
   /// Generated tokens are context of the levels after them (A11), not only the observed ones.
   bool generated_context = false;
-  int context_tokens = 0, chunk_tokens = 0;  // of the fine stage instead of the weights' own; 0: those
-  bool random_order = false;     // growth levels in which tokens come at random, as large as the breadth-first ones
+  int context_tokens = 0,
+      chunk_tokens = 0;  // of the fine stage instead of the weights' own; 0: those
+  bool random_order =
+      false;  // growth levels in which tokens come at random, as large as the breadth-first ones
   bool refine_observed = false;  // rewrite condition latents with the refinement head (A8)
   uint64_t seed = 1;
   /// Tokens (coordinates of the latents' level) that may be generated; all where null.
@@ -59,9 +62,9 @@ struct CompleteSettings {
   bool resumed = false;
 };
 
-/// Called after each growth level with all tokens so far (dropped ones too, if holes are to be closed) and
-/// the level that comes next. Completing those tokens from that level on, `resumed`, gives, bit by bit,
-/// what the uninterrupted run gives.
+/// Called after each growth level with all tokens so far (dropped ones too, if holes are to be
+/// closed) and the level that comes next. Completing those tokens from that level on, `resumed`,
+/// gives, bit by bit, what the uninterrupted run gives.
 using LevelListener = std::function<void(const LatentGrid& so_far, int32_t next_level)>;
 
 /// Trained networks, loaded once.
@@ -79,10 +82,11 @@ class Completer {
 
   /// `start` plus generated tokens: coarse gate, then growth level by level (A10-A13). `start` has
   /// observed tokens first; generated ones after them stay as they are and are not visited
-  /// again. Its rows come first, bit-identical unless refine_observed; generated latents are rounded
-  /// to half precision, so that files hold them exactly. `space` says what was seen empty; tokens that
-  /// are F or E in it are never visited. Places beyond 12.8 m are looked at in overlapping windows, by
-  /// the coarse stage and by the position code; windows without anything filled stay as they are. Same seed and threads, same grid.
+  /// again. Its rows come first, bit-identical unless refine_observed; generated latents are
+  /// rounded to half precision, so that files hold them exactly. `space` says what was seen empty;
+  /// tokens that are F or E in it are never visited. Places beyond 12.8 m are looked at in
+  /// overlapping windows, by the coarse stage and by the position code; windows without anything
+  /// filled stay as they are. Same seed and threads, same grid.
   LatentGrid complete(const LatentGrid& start, const ObservedSpace& space,
                       const CompleteSettings& settings, Progress& progress,
                       const LevelListener& listener = nullptr) const;

@@ -15,15 +15,17 @@ namespace {
 
 constexpr float kFrontierShare = .6f;  // of a chunk's targets, at most
 constexpr double kAlone = .75;         // of the samples: condition tokens are all that is visible
-constexpr double kOwnGate = .75;       // of the second half's samples: the fine stage works behind the coarse one as it is
-constexpr double kWindows = .5;        // of the samples: looked at through another window
+constexpr double kOwnGate =
+    .75;  // of the second half's samples: the fine stage works behind the coarse one as it is
+constexpr double kWindows = .5;  // of the samples: looked at through another window
 
 double uniform(torch::Generator& random) { return torch::rand({1}, random).item<double>(); }
 double uniform(double low, double high, torch::Generator& random) {
   return low + (high - low) * uniform(random);
 }
 
-std::vector<Coord> selectRandom(const std::vector<Coord>& from, double share, torch::Generator& random) {
+std::vector<Coord> selectRandom(const std::vector<Coord>& from, double share,
+                                torch::Generator& random) {
   const Tensor draws = torch::rand({int64_t(from.size())}, random);
   std::vector<Coord> chosen;
   for (size_t i = 0; i < from.size(); ++i)
@@ -41,14 +43,15 @@ CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const NodeStates& t
   const double hidden = uniform(random) < .5 ? 1.0 : uniform(.5, 1, random);
   const Tensor draws = torch::rand({int64_t(worked_on.size())}, random);
   for (size_t i = 0; i < worked_on.size(); ++i) {
-    const bool shown = truth.at(worked_on[i]) == NodeState::kFilled && draws.data_ptr<float>()[i] >= hidden;
+    const bool shown =
+        truth.at(worked_on[i]) == NodeState::kFilled && draws.data_ptr<float>()[i] >= hidden;
     (shown ? m.visible : m.targets).push_back(worked_on[i]);
   }
   return m;
 }
 
-FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& s, double false_positives,
-                      torch::Generator& random) {
+FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& s,
+                      double false_positives, torch::Generator& random) {
   FineMask m;
   const double kind = uniform(random);
   const bool alone = kind < kAlone, growth = kind < (1 + kAlone) / 2;
@@ -93,23 +96,29 @@ CoordBBox drawBounds(const CompletionSample& s, torch::Generator& random) {
   CoordBBox bounds = frame.bounds;
   for (int axis = 0; axis < 3; ++axis) {
     const int side = frame.bounds.dim()[axis] / 4;
-    auto move = [&](int room) { return int(torch::randint(-side / 4, room + 1, {1}, random).item<int64_t>()); };
-    const int low = move(std::clamp(most - side, 0, outwards)), high = move(std::clamp(most - side - low, 0, outwards));
+    auto move = [&](int room) {
+      return int(torch::randint(-side / 4, room + 1, {1}, random).item<int64_t>());
+    };
+    const int low = move(std::clamp(most - side, 0, outwards)),
+              high = move(std::clamp(most - side - low, 0, outwards));
     bounds.min()[axis] -= 4 * low, bounds.max()[axis] += 4 * high;
   }
-  const bool holds = std::any_of(s.condition.ijk.begin(), s.condition.ijk.end(), [&](const Coord& token) {
-    return bounds.isInside(Coord(2 * token.x(), 2 * token.y(), 2 * token.z()));
-  });
+  const bool holds =
+      std::any_of(s.condition.ijk.begin(), s.condition.ijk.end(), [&](const Coord& token) {
+        return bounds.isInside(Coord(2 * token.x(), 2 * token.y(), 2 * token.z()));
+      });
   return holds ? bounds : frame.bounds;
 }
 
 namespace {
 
-// Truth and weight of positions: F 1, E 0, U 0 with the configured low weight (training.md, spec A1).
+// Truth and weight of positions: F 1, E 0, U 0 with the configured low weight (training.md, spec
+// A1).
 struct Labels {
   Tensor truth, weight;  // [N]
 };
-Labels labelsOf(const std::vector<Coord>& positions, const NodeStates& truth, float unobserved_weight) {
+Labels labelsOf(const std::vector<Coord>& positions, const NodeStates& truth,
+                float unobserved_weight) {
   const int64_t n = int64_t(positions.size());
   Labels l{torch::zeros({n}), torch::ones({n})};
   for (int64_t i = 0; i < n; ++i) {
@@ -133,14 +142,14 @@ struct Losses {
   Tensor total() const { return coarse + fine + linear + .5f * diffusion + .25f * refinement; }
 };
 
-// Target latents by position, where the dense views saw a surface: what else a file holds is no truth
-// (spec A1).
+// Target latents by position, where the dense views saw a surface: what else a file holds is no
+// truth (spec A1).
 struct TargetRows {
   std::unordered_map<uint64_t, int64_t> row;
   std::vector<int64_t> all;
   static uint64_t key(const Coord& c) {
-    return uint64_t(uint32_t(c.x() + (1 << 20))) << 42 | uint64_t(uint32_t(c.y() + (1 << 20))) << 21 |
-           uint64_t(uint32_t(c.z() + (1 << 20)));
+    return uint64_t(uint32_t(c.x() + (1 << 20))) << 42 |
+           uint64_t(uint32_t(c.y() + (1 << 20))) << 21 | uint64_t(uint32_t(c.z() + (1 << 20)));
   }
   explicit TargetRows(const CompletionSample& s) {
     for (size_t i = 0; i < s.target.ijk.size(); ++i) {
@@ -155,23 +164,26 @@ struct TargetRows {
   }
 };
 
-// The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities there.
-Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s, const VoxelFrame& frame,
-                  torch::Generator& random, std::map<Coord, float>* gate) {
+// The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities
+// there.
+Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s,
+                  const VoxelFrame& frame, torch::Generator& random, std::map<Coord, float>* gate) {
   for (const Coord& c : scene.coarse_filled) (*gate)[c] = 1;
   CoarseMask mask = drawCoarseMask(scene.coarse_unknown, s.target_coarse, random);
   for (const Coord& c : mask.visible) (*gate)[c] = 1;
   if (mask.targets.empty()) return torch::zeros({});
   // Inference asks in chunks of neighbours; so does training.
-  const Coord around = mask.targets[size_t(torch::randint(int64_t(mask.targets.size()), {1}, random).item<int64_t>())];
-  const std::vector<Coord> targets = nearestOf(mask.targets, {double(around.x()), double(around.y()), double(around.z())},
-                                               net.config.coarse_chunk_tokens);
+  const Coord around = mask.targets[size_t(
+      torch::randint(int64_t(mask.targets.size()), {1}, random).item<int64_t>())];
+  const std::vector<Coord> targets =
+      nearestOf(mask.targets, {double(around.x()), double(around.y()), double(around.z())},
+                net.config.coarse_chunk_tokens);
   const Tensor logits = net.coarseLogits(
       coarseInputs(scene, mask.visible, targets, net.config.coarse_empty_tokens), frame);
   const Tensor p = logits.detach().sigmoid().contiguous();
   for (size_t i = 0; i < targets.size(); ++i) (*gate)[targets[i]] = p.data_ptr<float>()[i];
-  // Positions not worked on get the probability that a middling coarse stage would give them, so that the
-  // fine stage sees whole neighbourhoods.
+  // Positions not worked on get the probability that a middling coarse stage would give them, so
+  // that the fine stage sees whole neighbourhoods.
   const Tensor draws = torch::rand({int64_t(scene.coarse_unknown.size()), 2}, random);
   for (size_t i = 0; i < scene.coarse_unknown.size(); ++i) {
     const float* d = draws.data_ptr<float>() + 2 * i;
@@ -185,19 +197,20 @@ Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionS
                        net.config);
 }
 
-Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& colour_way, double own_gate,
-                    torch::Generator& random) {
+Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& colour_way,
+                    double own_gate, torch::Generator& random) {
   const CompleterConfig& c = net.config;
   VoxelFrame frame = s.condition.frame;
   frame.bounds = drawBounds(s, random);
-  const SceneTokens scene = sceneTokens(statesIn(s.seen_nodes, frame.bounds), statesIn(s.seen_coarse, frame.bounds));
+  const SceneTokens scene =
+      sceneTokens(statesIn(s.seen_nodes, frame.bounds), statesIn(s.seen_coarse, frame.bounds));
   std::map<Coord, float> gate;
   Losses l;
   l.coarse = c.coarse_stage ? coarseLoss(net, scene, s, frame, random, &gate) : torch::zeros({});
   l.fine = l.linear = l.diffusion = l.refinement = torch::zeros({});
 
-  // The fine stage works inside what the coarse stage keeps, as it is or as a better one would be: all of the truth and
-  // what it takes for true.
+  // The fine stage works inside what the coarse stage keeps, as it is or as a better one would be:
+  // all of the truth and what it takes for true.
   const bool own = !c.coarse_stage || uniform(random) < own_gate;
   const double tau = own ? CompleteSettings().coarse_tau : uniform(.05, .5, random);
   if (own) {
@@ -212,7 +225,8 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
   }
   std::vector<Coord> open;
   for (const auto& [node, probability] : gate)
-    if (probability > tau || (!own && s.target_coarse.at(node) == NodeState::kFilled)) open.push_back(node);
+    if (probability > tau || (!own && s.target_coarse.at(node) == NodeState::kFilled))
+      open.push_back(node);
   const std::vector<Coord> candidates = unobservedChildren(open, scene.nodes);
   const TargetRows rows(s);
   if (candidates.empty() || rows.all.empty()) return l;
@@ -220,7 +234,8 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
   const std::vector<Coord>& around = m.frontier.empty() ? m.others : m.frontier;
   if (around.empty()) return l;
 
-  const Coord centre_token = around[size_t(torch::randint(int64_t(around.size()), {1}, random).item<int64_t>())];
+  const Coord centre_token =
+      around[size_t(torch::randint(int64_t(around.size()), {1}, random).item<int64_t>())];
   const Eigen::Vector3d centre(centre_token.x(), centre_token.y(), centre_token.z());
   std::vector<Coord> targets =
       nearestOf(m.frontier, centre, int64_t(kFrontierShare * float(c.chunk_tokens)));
@@ -248,12 +263,15 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
       visible_rows.push_back(own >= 0 ? own : anyRow());
     }
   }
-  const Tensor condition_z = net.standardise(torch::tensor(s.condition.z).view({s.condition.size(), -1}));
+  const Tensor condition_z =
+      net.standardise(torch::tensor(s.condition.z).view({s.condition.size(), -1}));
   const Tensor target_z = net.standardise(torch::tensor(s.target.z).view({s.target.size(), -1}));
-  in[kCondition].features = condition_z.index_select(0, torch::tensor(condition_rows, torch::kInt64));
+  in[kCondition].features =
+      condition_z.index_select(0, torch::tensor(condition_rows, torch::kInt64));
   in[kVisible].features = target_z.index_select(0, torch::tensor(visible_rows, torch::kInt64));
-  in[kVisible].features = in[kVisible].features + uniform(0, c.context_noise, random) *
-                                                      torch::randn(in[kVisible].features.sizes(), random);
+  in[kVisible].features =
+      in[kVisible].features +
+      uniform(0, c.context_noise, random) * torch::randn(in[kVisible].features.sizes(), random);
   in[kEmptyToken].coords = nearestOf(scene.empty_shell, centre, c.empty_tokens);
   std::vector<float> parent_probability;
   for (const Coord& t : targets) {
@@ -266,7 +284,8 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
   l.fine = occupancyLoss(f.logits, labelsOf(targets, s.target_nodes, c.unobserved_weight), c);
 
   const SnrWeight weight = c.paper_snr_weight ? SnrWeight::kSnr : SnrWeight::kInverse;
-  auto latentLoss = [&](DiffusionHead& head, const Tensor& tokens, const std::vector<Coord>& coords) {
+  auto latentLoss = [&](DiffusionHead& head, const Tensor& tokens,
+                        const std::vector<Coord>& coords) {
     std::vector<int64_t> token_rows, target_rows;
     for (size_t i = 0; i < coords.size(); ++i) {
       const int64_t row = rows.find(coords[i]);
@@ -274,14 +293,18 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
     }
     if (token_rows.empty()) return DiffusionHead::Loss{torch::zeros({}), torch::zeros({})};
     return head.loss(tokens.index_select(0, torch::tensor(token_rows)),
-                     target_z.index_select(0, torch::tensor(target_rows)), colour_way, c.diffusion_draws, weight, random);
+                     target_z.index_select(0, torch::tensor(target_rows)), colour_way,
+                     c.diffusion_draws, weight, random);
   };
   const auto latent = latentLoss(*net.diffusion, f.targets, targets);
   l.linear = latent.linear, l.diffusion = latent.diffusion;
   // A fraction of the condition tokens is enough for a head that no other part learns from.
-  const std::vector<Coord> some(in[kCondition].coords.begin(),
-                                in[kCondition].coords.begin() + std::ptrdiff_t(std::min<size_t>(64, in[kCondition].coords.size())));
-  const auto refined = latentLoss(*net.refinement, f.conditions.slice(0, 0, int64_t(some.size())).detach(), some);
+  const std::vector<Coord> some(
+      in[kCondition].coords.begin(),
+      in[kCondition].coords.begin() +
+          std::ptrdiff_t(std::min<size_t>(64, in[kCondition].coords.size())));
+  const auto refined =
+      latentLoss(*net.refinement, f.conditions.slice(0, 0, int64_t(some.size())).detach(), some);
   l.refinement = refined.linear + .5f * refined.diffusion;
   return l;
 }
@@ -296,8 +319,9 @@ Tensor someLatents(const SampleSource& samples, int64_t count) {
   return torch::cat(all);
 }
 
-// The colour way [K, D] as a function of standardised latents, each row's results of unit deviation: where walls are
-// white and floors brown, a tint is a small error of few channels and a large one of these.
+// The colour way [K, D] as a function of standardised latents, each row's results of unit
+// deviation: where walls are white and floors brown, a tint is a small error of few channels and a
+// large one of these.
 Tensor colourWayOf(const std::vector<float>& rows, const Tensor& latents, const CompleterNet& net) {
   const Tensor way = torch::tensor(rows).view({-1, latents.size(1)});
   const Tensor deviation = torch::matmul(latents, way.t()).std(0).clamp_min(1e-3);
@@ -305,7 +329,8 @@ Tensor colourWayOf(const std::vector<float>& rows, const Tensor& latents, const 
 }
 
 // Roll-outs on validation samples: precision, recall, F1 on the nodes that were unobserved.
-std::map<std::string, double> validate(const std::string& weights, const std::vector<CompletionSample>& samples,
+std::map<std::string, double> validate(const std::string& weights,
+                                       const std::vector<CompletionSample>& samples,
                                        const std::vector<ObservedSpace>& spaces) {
   const Completer completer(weights);
   // Fixed, so that logs compare whatever the program's defaults are.
@@ -327,7 +352,8 @@ std::map<std::string, double> validate(const std::string& weights, const std::ve
       const int64_t row = rows.find(whole.ijk[size_t(k)]);
       if (row < 0) continue;
       for (int d = 0; d < whole.dim; ++d)
-        squared += std::pow(whole.z[size_t(k * whole.dim + d)] - s.target.z[size_t(row * whole.dim + d)], 2);
+        squared += std::pow(
+            whole.z[size_t(k * whole.dim + d)] - s.target.z[size_t(row * whole.dim + d)], 2);
       matched += whole.dim;
     }
     const double p = filled > 0 ? hit / filled : 0, r = truth > 0 ? hit / truth : 0;
@@ -335,7 +361,9 @@ std::map<std::string, double> validate(const std::string& weights, const std::ve
     error += matched > 0 ? squared / matched : 0;
   }
   const double n = double(std::max<size_t>(1, samples.size()));
-  return {{"val_precision", precision / n}, {"val_recall", recall / n}, {"val_f1", f1 / n},
+  return {{"val_precision", precision / n},
+          {"val_recall", recall / n},
+          {"val_f1", f1 / n},
           {"val_latent_mse", error / n}};
 }
 
@@ -353,11 +381,14 @@ ObservedSpace nodeSpace(const CompletionSample& s) {
 
 }  // namespace
 
-void trainCompleter(const CompleterConfig& config, const std::vector<float>& colour_way, const SampleSource& samples, int64_t sample_count,
-                    const SampleSource& validation, int validation_count, const TrainSettings& settings,
-                    const TrainListener& listener, Progress& progress) {
+void trainCompleter(const CompleterConfig& config, const std::vector<float>& colour_way,
+                    const SampleSource& samples, int64_t sample_count,
+                    const SampleSource& validation, int validation_count,
+                    const TrainSettings& settings, const TrainListener& listener,
+                    Progress& progress) {
   torch::manual_seed(settings.seed);
-  auto net = std::make_shared<CompleterNet>(config), average = std::make_shared<CompleterNet>(config);
+  auto net = std::make_shared<CompleterNet>(config),
+       average = std::make_shared<CompleterNet>(config);
   const Tensor latents = someLatents(samples, sample_count);
   if (!settings.from.empty()) {
     const TensorFile start = readTensors(settings.from);
@@ -365,7 +396,8 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
   } else if (!settings.resume) {
     torch::NoGradGuard no_grad;
     for (CompleterNet* n : {net.get(), average.get()})
-      n->latent_mean.copy_(latents.mean(0)), n->latent_deviation.copy_(latents.std(0).clamp_min(1e-3));
+      n->latent_mean.copy_(latents.mean(0)),
+          n->latent_deviation.copy_(latents.std(0).clamp_min(1e-3));
   }
   Trainer trainer(net, average, "completer", config.toJson(), settings, listener);
   const Tensor colours = colourWayOf(colour_way, latents, *net);
@@ -379,8 +411,10 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
   auto load = [&](int64_t first) {
     std::vector<CompletionSample> all;
     for (int64_t at = first; at < first + trainer.samples(); ++at) {
-      torch::Generator epoch = at::detail::createCPUGenerator(settings.seed + 17 + uint64_t(at / sample_count));
-      all.push_back(samples(uint64_t(torch::randperm(sample_count, epoch)[at % sample_count].item<int64_t>())));
+      torch::Generator epoch =
+          at::detail::createCPUGenerator(settings.seed + 17 + uint64_t(at / sample_count));
+      all.push_back(samples(
+          uint64_t(torch::randperm(sample_count, epoch)[at % sample_count].item<int64_t>())));
     }
     return all;
   };
@@ -393,13 +427,17 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
     // Before the coarse stage is any good, there is nothing behind it to learn from.
     const double own_gate = 2 * trainer.step() < settings.steps ? 0 : kOwnGate;
     for (size_t k = 0; k < current.size(); ++k) {
-      torch::Generator random = at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(first) + k);
+      torch::Generator random =
+          at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(first) + k);
       const MixedPrecision mixed(settings.mixed_precision);
       const Losses l = sampleLosses(*net, current[k], colours, own_gate, random);
       const Tensor total = l.total();
-      trainer.addSample(total, {{"loss", total.item<double>()}, {"coarse", l.coarse.item<double>()},
-                                {"fine", l.fine.item<double>()}, {"linear", l.linear.item<double>()},
-                                {"diffusion", l.diffusion.item<double>()}, {"refinement", l.refinement.item<double>()}});
+      trainer.addSample(total, {{"loss", total.item<double>()},
+                                {"coarse", l.coarse.item<double>()},
+                                {"fine", l.fine.item<double>()},
+                                {"linear", l.linear.item<double>()},
+                                {"diffusion", l.diffusion.item<double>()},
+                                {"refinement", l.refinement.item<double>()}});
     }
     trainer.update();
     if (trainer.validationDue()) {
@@ -412,7 +450,8 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
   progress.end();
 }
 
-CompleterStep completerStep(const CompleterConfig& config, const CompletionSample& sample, uint64_t seed) {
+CompleterStep completerStep(const CompleterConfig& config, const CompletionSample& sample,
+                            uint64_t seed) {
   torch::manual_seed(seed);
   auto net = std::make_shared<CompleterNet>(config);
   torch::optim::AdamW optimiser(net->parameters(), torch::optim::AdamWOptions(1e-3));
@@ -462,7 +501,8 @@ NodeStates statesOf(const Tensor& t, const std::string& path) {
     require(p[4 + i] >= p[1 + i] && int64_t(p[4 + i]) - p[1 + i] < 8192, "readSample: ", path,
             ": expected a box of at most 8192 nodes a side");
   const int64_t n = int64_t(s.box.volume());
-  require(t.numel() == 7 + (n + 3) / 4, "readSample: ", path, ": expected ", n, " states, found another count");
+  require(t.numel() == 7 + (n + 3) / 4, "readSample: ", path, ": expected ", n,
+          " states, found another count");
   s.states.resize(size_t(n));
   std::memcpy(s.states.data(), p + 7, size_t(n));
   for (NodeState state : s.states)
@@ -474,8 +514,9 @@ NodeStates statesOf(const Tensor& t, const std::string& path) {
 
 void writeSample(const CompletionSample& s, const std::string& path) {
   TensorFile file;
-  for (const auto& [name, grid] : {std::pair<const char*, const LatentGrid*>{"condition", &s.condition},
-                                   {"target", &s.target}}) {
+  for (const auto& [name, grid] :
+       {std::pair<const char*, const LatentGrid*>{"condition", &s.condition},
+        {"target", &s.target}}) {
     file.tensors[joinText(name, ".ijk")] = coordTensor(grid->ijk);
     file.tensors[joinText(name, ".z")] = torch::tensor(grid->z).view({grid->size(), grid->dim});
   }
@@ -484,8 +525,9 @@ void writeSample(const CompletionSample& s, const std::string& path) {
   file.tensors["target_nodes"] = stateTensor(s.target_nodes);
   file.tensors["target_coarse"] = stateTensor(s.target_coarse);
   const CoordBBox& b = s.condition.frame.bounds;
-  file.tensors["bounds"] = torch::tensor({b.min().x(), b.min().y(), b.min().z(), b.max().x(), b.max().y(),
-                                          b.max().z()}, torch::kInt32);
+  file.tensors["bounds"] =
+      torch::tensor({b.min().x(), b.min().y(), b.min().z(), b.max().x(), b.max().y(), b.max().z()},
+                    torch::kInt32);
   file.tensors["voxel_m"] = torch::tensor({s.condition.frame.voxel_m});
   writeTensors(file, path);
 }
@@ -494,8 +536,8 @@ CompletionSample readSample(const std::string& path) {
   const TensorFile file = readTensors(path);
   auto get = [&](const std::string& name, torch::ScalarType type) {
     const auto found = file.tensors.find(name);
-    require(found != file.tensors.end() && found->second.scalar_type() == type, "readSample: ", path,
-            ": expected a tensor ", name);
+    require(found != file.tensors.end() && found->second.scalar_type() == type,
+            "readSample: ", path, ": expected a tensor ", name);
     return found->second;
   };
   CompletionSample s;
@@ -507,11 +549,13 @@ CompletionSample readSample(const std::string& path) {
   require(bounds.numel() == 6 && voxel.numel() == 1, "readSample: ", path, ": bad frame");
   for (const auto& [name, grid] :
        {std::pair<const char*, LatentGrid*>{"condition", &s.condition}, {"target", &s.target}}) {
-    const Tensor ijk = get(joinText(name, ".ijk"), torch::kInt32), z = get(joinText(name, ".z"), torch::kFloat32);
-    require(ijk.dim() == 2 && ijk.size(1) == 3 && z.dim() == 2 && z.size(0) == ijk.size(0), "readSample: ",
-            path, ": ", name, ": coordinates and latents disagree");
+    const Tensor ijk = get(joinText(name, ".ijk"), torch::kInt32),
+                 z = get(joinText(name, ".z"), torch::kFloat32);
+    require(ijk.dim() == 2 && ijk.size(1) == 3 && z.dim() == 2 && z.size(0) == ijk.size(0),
+            "readSample: ", path, ": ", name, ": coordinates and latents disagree");
     const int32_t* p = ijk.data_ptr<int32_t>();
-    for (int64_t i = 0; i < ijk.size(0); ++i) grid->ijk.emplace_back(p[3 * i], p[3 * i + 1], p[3 * i + 2]);
+    for (int64_t i = 0; i < ijk.size(0); ++i)
+      grid->ijk.emplace_back(p[3 * i], p[3 * i + 1], p[3 * i + 2]);
     grid->dim = int(z.size(1));
     grid->z.assign(z.data_ptr<float>(), z.data_ptr<float>() + z.numel());
     grid->observed.assign(grid->ijk.size(), 1);

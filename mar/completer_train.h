@@ -1,5 +1,6 @@
 #pragma once
-// Masked training of the completer on latents of the frozen encoder (paper sec. 4, spec A2, A3, A14).
+// Masked training of the completer on latents of the frozen encoder (paper sec. 4, spec A2, A3,
+// A14).
 #include <functional>
 #include <string>
 
@@ -8,12 +9,12 @@
 
 namespace vdbc {
 
-/// One training scene in latent space: what a few condition views see and what many views see, in the
-/// same frame. Needs no 3-D ground truth.
+/// One training scene in latent space: what a few condition views see and what many views see, in
+/// the same frame. Needs no 3-D ground truth.
 struct CompletionSample {
-  LatentGrid condition, target;               // E(sparse), E(dense)
-  NodeStates seen_nodes, seen_coarse;         // of the condition views, levels 1 and 2
-  NodeStates target_nodes, target_coarse;     // of the dense views
+  LatentGrid condition, target;            // E(sparse), E(dense)
+  NodeStates seen_nodes, seen_coarse;      // of the condition views, levels 1 and 2
+  NodeStates target_nodes, target_coarse;  // of the dense views
 };
 
 /// Temporary name, then rename; safetensors. Throw Error.
@@ -22,23 +23,27 @@ CompletionSample readSample(const std::string& path);
 
 using SampleSource = std::function<CompletionSample(uint64_t index)>;
 
-/// Trains both stages (or resumes). Each step: one sample. Coarse: a random share (.3-1) of the unknown
-/// coarse positions is worked on, a random part of the truth may be visible. Fine: three quarters of the
-/// masks show condition tokens alone and ask about one BFS level, the rest are growth states or hide a
-/// random .5-1 of the truth; visible tokens get noise and false positives as roll-outs have them. Errors of latents count
-/// twice: of all channels, and of what `colour_way` ([K, latent_dim] by rows, Encoder::colourWay()) makes of them. Validation by roll-outs: precision, recall and F1
-/// on unobserved level-1 nodes against the dense views' truth.
-void trainCompleter(const CompleterConfig& config, const std::vector<float>& colour_way, const SampleSource& samples, int64_t sample_count,
-                    const SampleSource& validation, int validation_count, const TrainSettings& settings,
-                    const TrainListener& listener, Progress& progress);
+/// Trains both stages (or resumes). Each step: one sample. Coarse: a random share (.3-1) of the
+/// unknown coarse positions is worked on, a random part of the truth may be visible. Fine: three
+/// quarters of the masks show condition tokens alone and ask about one BFS level, the rest are
+/// growth states or hide a random .5-1 of the truth; visible tokens get noise and false positives
+/// as roll-outs have them. Errors of latents count twice: of all channels, and of what `colour_way`
+/// ([K, latent_dim] by rows, Encoder::colourWay()) makes of them. Validation by roll-outs:
+/// precision, recall and F1 on unobserved level-1 nodes against the dense views' truth.
+void trainCompleter(const CompleterConfig& config, const std::vector<float>& colour_way,
+                    const SampleSource& samples, int64_t sample_count,
+                    const SampleSource& validation, int validation_count,
+                    const TrainSettings& settings, const TrainListener& listener,
+                    Progress& progress);
 
-/// For tests: builds a network with `seed`, runs one step on the sample twice; the total loss before and
-/// after, and a checksum of all gradients of the first pass.
+/// For tests: builds a network with `seed`, runs one step on the sample twice; the total loss
+/// before and after, and a checksum of all gradients of the first pass.
 struct CompleterStep {
   double before = 0, after = 0;
-  double gradient_sum = 0;            // of absolute values
+  double gradient_sum = 0;                  // of absolute values
   double trunk_gradient_of_refinement = 0;  // absolute sum; spec A8: exactly 0
 };
-CompleterStep completerStep(const CompleterConfig& config, const CompletionSample& sample, uint64_t seed);
+CompleterStep completerStep(const CompleterConfig& config, const CompletionSample& sample,
+                            uint64_t seed);
 
 }  // namespace vdbc

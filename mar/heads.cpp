@@ -8,7 +8,8 @@ namespace nn = torch::nn;
 
 Tensor focalLoss(const Tensor& logits, const Tensor& truth, const Tensor& weights, double gamma,
                  double alpha) {
-  const Tensor bce = torch::binary_cross_entropy_with_logits(logits, truth, {}, {}, at::Reduction::None);
+  const Tensor bce =
+      torch::binary_cross_entropy_with_logits(logits, truth, {}, {}, at::Reduction::None);
   const Tensor p = logits.sigmoid();
   const Tensor miss = truth * (1 - p) + (1 - truth) * p;  // 1 - p_t
   const Tensor alpha_t = truth * alpha + (1 - truth) * (1 - alpha);
@@ -47,7 +48,8 @@ DiffusionHead::DiffusionHead(int width, int latent, int hidden, int steps_)
   condition = register_module("condition", Linear(width, hidden));
   time = register_module("time", Linear(64, hidden));
   for (int i = 0; i < 2; ++i) {
-    modulation.push_back(register_module("modulation" + std::to_string(i), Linear(hidden, 3 * hidden)));
+    modulation.push_back(
+        register_module("modulation" + std::to_string(i), Linear(hidden, 3 * hidden)));
     layers.push_back(register_module("layer" + std::to_string(i),
                                      std::make_shared<Mlp>(hidden, hidden, hidden)));
   }
@@ -64,10 +66,11 @@ void DiffusionHead::zeroStart() {
 }
 
 Tensor DiffusionHead::noise(const Tensor& x, const Tensor& t, const Tensor& h) {
-  const Tensor octaves = torch::exp(torch::arange(32, torch::kFloat32) * float(-std::log(1e4) / 31));
+  const Tensor octaves =
+      torch::exp(torch::arange(32, torch::kFloat32) * float(-std::log(1e4) / 31));
   const Tensor angle = (t.to(torch::kFloat32) * (1000.f / float(steps))).unsqueeze(1) * octaves;
-  const Tensor c = torch::silu(condition->forward(h) +
-                               time->forward(torch::cat({angle.sin(), angle.cos()}, 1)));
+  const Tensor c =
+      torch::silu(condition->forward(h) + time->forward(torch::cat({angle.sin(), angle.cos()}, 1)));
   auto normed = [](const Tensor& v) { return torch::layer_norm(v, {v.size(1)}); };
   Tensor y = in->forward(x);
   for (size_t i = 0; i < layers.size(); ++i) {
@@ -78,8 +81,9 @@ Tensor DiffusionHead::noise(const Tensor& x, const Tensor& t, const Tensor& h) {
   return out->forward(normed(y) * (1 + m[1]) + m[0]);
 }
 
-DiffusionHead::Loss DiffusionHead::loss(const Tensor& h, const Tensor& target, const Tensor& colour_way, int draws,
-                                        SnrWeight kind, torch::Generator& random) {
+DiffusionHead::Loss DiffusionHead::loss(const Tensor& h, const Tensor& target,
+                                        const Tensor& colour_way, int draws, SnrWeight kind,
+                                        torch::Generator& random) {
   Loss l;
   const Tensor predicted = mean(h), error = predicted - target;
   l.linear = error.square().mean() + torch::matmul(error, colour_way.t()).square().mean();
@@ -110,7 +114,8 @@ Tensor DiffusionHead::sample(const Tensor& h, int sampling_steps, double tempera
     const double bar = bars[now], bar_next = i + 1 == sampling_steps ? 1.0 : double(bars[next]);
     const Tensor predicted = noise(x, torch::full({x.size(0)}, now, torch::kInt64), h);
     // The first steps divide by .01: an error of the noise becomes 100 of x0. No latent lies there.
-    const Tensor x0 = ((x - std::sqrt(1 - bar) * predicted) / std::sqrt(bar)).clamp(-kLargest, kLargest);
+    const Tensor x0 =
+        ((x - std::sqrt(1 - bar) * predicted) / std::sqrt(bar)).clamp(-kLargest, kLargest);
     const Tensor epsilon = (x - std::sqrt(bar) * x0) / std::sqrt(1 - bar);
     x = std::sqrt(bar_next) * x0 + std::sqrt(1 - bar_next) * epsilon;
   }

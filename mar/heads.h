@@ -4,8 +4,8 @@
 
 namespace vdbc {
 
-/// Focal loss, mean of weights * alpha_t (1 - p_t)^gamma * BCE; alpha_t = alpha for truth 1, 1 - alpha
-/// for 0. gamma 0 and alpha .5 is half the BCE. logits, truth, weights: [N]. Lin et al. 2017.
+/// Focal loss, mean of weights * alpha_t (1 - p_t)^gamma * BCE; alpha_t = alpha for truth 1, 1 -
+/// alpha for 0. gamma 0 and alpha .5 is half the BCE. logits, truth, weights: [N]. Lin et al. 2017.
 Tensor focalLoss(const Tensor& logits, const Tensor& truth, const Tensor& weights, double gamma,
                  double alpha);
 
@@ -21,13 +21,15 @@ std::vector<float> cosineAlphaBar(int steps);
 
 /// Which noise levels count how much in the loss. The paper contradicts itself here: both are kept.
 enum class SnrWeight {
-  kInverse,  // min(1 / alpha_bar, 20): a plain error of x0 scaled up with noise; trains fastest here
+  kInverse,  // min(1 / alpha_bar, 20): a plain error of x0 scaled up with noise; trains fastest
+             // here
   kSnr       // SNR / (1 + SNR) = alpha_bar: falls with noise (the paper's remark)
 };
 float snrWeight(SnrWeight kind, float alpha_bar);
 
-/// Predicts a latent from a token: a linear mean, and a DDPM over the residual around it. The denoiser is
-/// token-wise, adaLN-conditioned, zero-initialised at its output (Li et al. 2024; Peebles & Xie 2023).
+/// Predicts a latent from a token: a linear mean, and a DDPM over the residual around it. The
+/// denoiser is token-wise, adaLN-conditioned, zero-initialised at its output (Li et al. 2024;
+/// Peebles & Xie 2023).
 struct DiffusionHead : torch::nn::Module {
   DiffusionHead(int width, int latent_dim, int hidden, int steps);
 
@@ -37,11 +39,11 @@ struct DiffusionHead : torch::nn::Module {
   struct Loss {
     Tensor linear, diffusion;
   };
-  /// Squared errors, mean over tokens and channels, of the linear mean also over its colours: `colour_way` [K, D] makes
-  /// them. `draws` noise levels a token (0: the linear mean alone).
+  /// Squared errors, mean over tokens and channels, of the linear mean also over its colours:
+  /// `colour_way` [K, D] makes them. `draws` noise levels a token (0: the linear mean alone).
   /// Behind the linear mean is a stop-gradient.
-  Loss loss(const Tensor& h, const Tensor& target, const Tensor& colour_way, int draws, SnrWeight weight,
-            torch::Generator& random);
+  Loss loss(const Tensor& h, const Tensor& target, const Tensor& colour_way, int draws,
+            SnrWeight weight, torch::Generator& random);
   /// `sampling_steps` deterministic (DDIM) steps from noise of deviation `temperature`; 0 steps, or
   /// temperature 0, is the linear mean.
   Tensor sample(const Tensor& h, int sampling_steps, double temperature, torch::Generator& random);

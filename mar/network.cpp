@@ -7,7 +7,8 @@ namespace vdbc {
 
 namespace nn = torch::nn;
 
-MaskedTransformer::MaskedTransformer(const StageSizes& s, bool rotary_positions_, bool position_code_)
+MaskedTransformer::MaskedTransformer(const StageSizes& s, bool rotary_positions_,
+                                     bool position_code_)
     : sizes(s), rotary_positions(rotary_positions_), position_code(position_code_) {
   static const char* const kNames[] = {"condition", "visible", "empty", "target"};
   for (size_t k = 0; k < kTokenKinds; ++k) {
@@ -19,23 +20,26 @@ MaskedTransformer::MaskedTransformer(const StageSizes& s, bool rotary_positions_
   }
   position_in = register_module("position_in", Linear(kSinusoidalDim, s.width));
   for (int i = 0; i < s.layers; ++i) {
-    h1.push_back(register_module("h1_" + std::to_string(i), std::make_shared<SelfBlock>(s.width, s.heads)));
-    h2.push_back(register_module("h2_" + std::to_string(i), std::make_shared<SelfBlock>(s.width, s.heads)));
+    h1.push_back(
+        register_module("h1_" + std::to_string(i), std::make_shared<SelfBlock>(s.width, s.heads)));
+    h2.push_back(
+        register_module("h2_" + std::to_string(i), std::make_shared<SelfBlock>(s.width, s.heads)));
   }
   out_norm = register_module("out_norm", nn::LayerNorm(nn::LayerNormOptions({s.width})));
 }
 
-MaskedTransformer::Output MaskedTransformer::forward(const std::array<TokenSet, kTokenKinds>& inputs,
-                                                     int level, const VoxelFrame& frame) {
+MaskedTransformer::Output MaskedTransformer::forward(
+    const std::array<TokenSet, kTokenKinds>& inputs, int level, const VoxelFrame& frame) {
   std::vector<Tensor> tokens(kTokenKinds), coords(kTokenKinds);
   for (size_t k = 0; k < kTokenKinds; ++k) {
     const int64_t n = int64_t(inputs[k].coords.size());
     coords[k] = coordTensor(inputs[k].coords);
     const Tensor features = sizes.feature_dims[k] ? inputs[k].features : torch::ones({n, 1});
-    tokens[k] = embed_norm[k]->forward(embed[k]->forward(features.view({n, std::max(1, sizes.feature_dims[k])})));
+    tokens[k] = embed_norm[k]->forward(
+        embed[k]->forward(features.view({n, std::max(1, sizes.feature_dims[k])})));
     if (position_code)
-      tokens[k] = tokens[k] +
-                  position_in->forward(sinusoidalCode(tokenPositions(coords[k], level, frame)));
+      tokens[k] =
+          tokens[k] + position_in->forward(sinusoidalCode(tokenPositions(coords[k], level, frame)));
   }
   const Tensor all_coords = torch::cat(coords);
   const Rotary pos = rotary(all_coords, sizes.width / sizes.heads);
@@ -44,7 +48,8 @@ MaskedTransformer::Output MaskedTransformer::forward(const std::array<TokenSet, 
   constexpr int kFull = 1 << 30;  // full attention: one window holds everything
   Output out;
   Tensor x = torch::cat({tokens[kCondition], tokens[kVisible], tokens[kEmptyToken]});
-  for (auto& block : h1) x = block->forward(x, rotary_positions ? &context_pos : nullptr, {}, kFull, false);
+  for (auto& block : h1)
+    x = block->forward(x, rotary_positions ? &context_pos : nullptr, {}, kFull, false);
   out.context = x;
   x = torch::cat({x, tokens[kTarget]});
   for (auto& block : h2) x = block->forward(x, rotary_positions ? &pos : nullptr, {}, kFull, false);
@@ -64,20 +69,24 @@ Tensor coarseFeatures(const std::vector<Coord>& nodes, const NodeStates& childre
 }
 
 CompleterNet::CompleterNet(const CompleterConfig& c) : config(c) {
-  coarse = register_module(
-      "coarse", std::make_shared<MaskedTransformer>(
-                    StageSizes{c.coarse_width, c.coarse_heads, c.coarse_layers,
-                               {kCoarseFeatures, 0, kCoarseFeatures, kCoarseFeatures}},
-                    c.rotary_positions, c.position_code));
+  coarse = register_module("coarse",
+                           std::make_shared<MaskedTransformer>(
+                               StageSizes{c.coarse_width,
+                                          c.coarse_heads,
+                                          c.coarse_layers,
+                                          {kCoarseFeatures, 0, kCoarseFeatures, kCoarseFeatures}},
+                               c.rotary_positions, c.position_code));
   // Targets carry the coarse stage's probability of their parent.
   trunk = register_module(
       "trunk", std::make_shared<MaskedTransformer>(
                    StageSizes{c.width, c.heads, c.layers, {c.latent_dim, c.latent_dim, 0, 1}},
                    c.rotary_positions, c.position_code));
-  coarse_occupancy = register_module("coarse_occupancy", std::make_shared<OccupancyHead>(c.coarse_width));
+  coarse_occupancy =
+      register_module("coarse_occupancy", std::make_shared<OccupancyHead>(c.coarse_width));
   occupancy = register_module("occupancy", std::make_shared<OccupancyHead>(c.width));
   auto head = [&] {
-    return std::make_shared<DiffusionHead>(c.width, c.latent_dim, c.diffusion_width, c.diffusion_steps);
+    return std::make_shared<DiffusionHead>(c.width, c.latent_dim, c.diffusion_width,
+                                           c.diffusion_steps);
   };
   diffusion = register_module("diffusion", head());
   refinement = register_module("refinement", head());
@@ -95,11 +104,15 @@ Tensor CompleterNet::coarseLogits(const std::array<TokenSet, kTokenKinds>& input
 }
 
 void CompleterNet::coarseProbabilities(const SceneTokens& scene, const std::vector<Coord>& unknown,
-                                       const VoxelFrame& frame, std::map<Coord, float>* probability) {
+                                       const VoxelFrame& frame,
+                                       std::map<Coord, float>* probability) {
   for (const std::vector<Coord>& targets : chunksOf(unknown, config.coarse_chunk_tokens)) {
-    const Tensor p = config.coarse_stage
-                         ? coarseLogits(coarseInputs(scene, {}, targets, config.coarse_empty_tokens), frame).sigmoid().contiguous()
-                         : torch::ones({int64_t(targets.size())});
+    const Tensor p =
+        config.coarse_stage
+            ? coarseLogits(coarseInputs(scene, {}, targets, config.coarse_empty_tokens), frame)
+                  .sigmoid()
+                  .contiguous()
+            : torch::ones({int64_t(targets.size())});
     for (size_t i = 0; i < targets.size(); ++i) (*probability)[targets[i]] = p.data_ptr<float>()[i];
   }
 }
@@ -132,10 +145,15 @@ bool touchesUnobserved(const NodeStates& s, const Coord& ijk) {
 SceneTokens sceneTokens(NodeStates nodes, NodeStates coarse) {
   SceneTokens t;
   for (auto i = nodes.box.begin(); i; ++i)
-    if (nodes.at(*i) == NodeState::kEmpty && touchesUnobserved(nodes, *i)) t.empty_shell.push_back(*i);
+    if (nodes.at(*i) == NodeState::kEmpty && touchesUnobserved(nodes, *i))
+      t.empty_shell.push_back(*i);
   for (auto i = coarse.box.begin(); i; ++i) switch (coarse.at(*i)) {
-      case NodeState::kFilled: t.coarse_filled.push_back(*i); break;
-      case NodeState::kUnobserved: t.coarse_unknown.push_back(*i); break;
+      case NodeState::kFilled:
+        t.coarse_filled.push_back(*i);
+        break;
+      case NodeState::kUnobserved:
+        t.coarse_unknown.push_back(*i);
+        break;
       case NodeState::kEmpty:
         if (touchesUnobserved(coarse, *i)) t.coarse_empty.push_back(*i);
     }
@@ -145,12 +163,14 @@ SceneTokens sceneTokens(NodeStates nodes, NodeStates coarse) {
 
 std::array<TokenSet, kTokenKinds> coarseInputs(const SceneTokens& scene,
                                                const std::vector<Coord>& visible,
-                                               const std::vector<Coord>& targets, int empty_tokens) {
+                                               const std::vector<Coord>& targets,
+                                               int empty_tokens) {
   std::array<TokenSet, kTokenKinds> in;
   in[kCondition] = {coarseFeatures(scene.coarse_filled, scene.nodes), scene.coarse_filled};
   in[kVisible] = {{}, visible};
   // An even share of the empty shell: every k-th, so that it outlines the whole seen space.
-  const size_t most = size_t(empty_tokens), stride = most ? (scene.coarse_empty.size() + most - 1) / most : 0;
+  const size_t most = size_t(empty_tokens),
+               stride = most ? (scene.coarse_empty.size() + most - 1) / most : 0;
   for (size_t i = 0; stride && i < scene.coarse_empty.size(); i += stride)
     in[kEmptyToken].coords.push_back(scene.coarse_empty[i]);
   in[kEmptyToken].features = coarseFeatures(in[kEmptyToken].coords, scene.nodes);
@@ -162,16 +182,19 @@ std::vector<int64_t> nearestRows(const std::vector<Coord>& coords, const Eigen::
                                  int64_t count) {
   std::vector<std::pair<double, int64_t>> by_distance(coords.size());
   for (size_t i = 0; i < coords.size(); ++i)
-    by_distance[i] = {(Eigen::Vector3d(coords[i].x(), coords[i].y(), coords[i].z()) - centre).squaredNorm(),
-                      int64_t(i)};
+    by_distance[i] = {
+        (Eigen::Vector3d(coords[i].x(), coords[i].y(), coords[i].z()) - centre).squaredNorm(),
+        int64_t(i)};
   const size_t n = std::min(coords.size(), size_t(count));
-  std::partial_sort(by_distance.begin(), by_distance.begin() + std::ptrdiff_t(n), by_distance.end());
+  std::partial_sort(by_distance.begin(), by_distance.begin() + std::ptrdiff_t(n),
+                    by_distance.end());
   std::vector<int64_t> rows(n);
   for (size_t i = 0; i < n; ++i) rows[i] = by_distance[i].second;
   return rows;
 }
 
-std::vector<Coord> nearestOf(const std::vector<Coord>& coords, const Eigen::Vector3d& centre, int64_t count) {
+std::vector<Coord> nearestOf(const std::vector<Coord>& coords, const Eigen::Vector3d& centre,
+                             int64_t count) {
   std::vector<Coord> nearest;
   for (int64_t row : nearestRows(coords, centre, count)) nearest.push_back(coords[size_t(row)]);
   return nearest;
@@ -200,7 +223,8 @@ std::vector<Coord> unobservedChildren(const std::vector<Coord>& coarse, const No
   for (const Coord& c : coarse)
     for (int slot = 0; slot < 8; ++slot) {
       const Coord child = childCoord(c, slot);
-      if (nodes.box.isInside(child) && nodes.at(child) == NodeState::kUnobserved) children.push_back(child);
+      if (nodes.box.isInside(child) && nodes.at(child) == NodeState::kUnobserved)
+        children.push_back(child);
     }
   return children;
 }

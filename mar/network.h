@@ -30,7 +30,8 @@ struct MaskedTransformer : torch::nn::Module {
     Tensor context;  // [condition + visible + empty, C], H1's output
     Tensor tokens;   // [all, C], H2's output, same order, targets last
   };
-  Output forward(const std::array<TokenSet, kTokenKinds>& inputs, int level, const VoxelFrame& frame);
+  Output forward(const std::array<TokenSet, kTokenKinds>& inputs, int level,
+                 const VoxelFrame& frame);
 
   const StageSizes sizes;
   const bool rotary_positions, position_code;
@@ -47,11 +48,11 @@ Tensor coarseFeatures(const std::vector<Coord>& nodes, const NodeStates& childre
 
 /// What is known of a scene, as token lists of both levels.
 struct SceneTokens {
-  NodeStates nodes, coarse;               // levels 1 and 2
-  std::vector<Coord> empty_shell;         // level-1 E nodes with an unobserved neighbour
-  std::vector<Coord> coarse_filled;       // level-2 nodes with an F voxel
-  std::vector<Coord> coarse_empty;        // level-2 E nodes with an unobserved neighbour
-  std::vector<Coord> coarse_unknown;      // level-2 nodes with no F and some U voxel
+  NodeStates nodes, coarse;           // levels 1 and 2
+  std::vector<Coord> empty_shell;     // level-1 E nodes with an unobserved neighbour
+  std::vector<Coord> coarse_filled;   // level-2 nodes with an F voxel
+  std::vector<Coord> coarse_empty;    // level-2 E nodes with an unobserved neighbour
+  std::vector<Coord> coarse_unknown;  // level-2 nodes with no F and some U voxel
 };
 SceneTokens sceneTokens(NodeStates nodes, NodeStates coarse);
 
@@ -60,9 +61,10 @@ struct CompleterNet : torch::nn::Module {
 
   /// Occupancy logits [targets] of coarse nodes.
   Tensor coarseLogits(const std::array<TokenSet, kTokenKinds>& inputs, const VoxelFrame& frame);
-  /// Their probabilities as inference asks for them, in chunks of neighbours; 1 without a coarse stage.
-  void coarseProbabilities(const SceneTokens& scene, const std::vector<Coord>& unknown, const VoxelFrame& frame,
-                           std::map<Coord, float>* probability);
+  /// Their probabilities as inference asks for them, in chunks of neighbours; 1 without a coarse
+  /// stage.
+  void coarseProbabilities(const SceneTokens& scene, const std::vector<Coord>& unknown,
+                           const VoxelFrame& frame, std::map<Coord, float>* probability);
   struct Fine {
     Tensor logits;      // [targets]
     Tensor targets;     // [targets, C] tokens for the diffusion head
@@ -72,10 +74,12 @@ struct CompleterNet : torch::nn::Module {
 
   /// Latents <-> unit deviation.
   Tensor standardise(const Tensor& z) { return (z - latent_mean) / latent_deviation; }
-  /// Standardised predictions put back where latents lie: the encoder normalises each token's channel
-  /// groups, a mean does not. Growth that sees what it made drifts without it; on its own a mean is the better colour.
+  /// Standardised predictions put back where latents lie: the encoder normalises each token's
+  /// channel groups, a mean does not. Growth that sees what it made drifts without it; on its own a
+  /// mean is the better colour.
   Tensor project(const Tensor& z) {
-    return config.latent_groups ? standardise(torch::group_norm(restore(z), config.latent_groups)) : z;
+    return config.latent_groups ? standardise(torch::group_norm(restore(z), config.latent_groups))
+                                : z;
   }
   Tensor restore(const Tensor& z) { return z * latent_deviation + latent_mean; }
 
@@ -95,7 +99,8 @@ std::array<TokenSet, kTokenKinds> coarseInputs(const SceneTokens& scene,
 std::vector<int64_t> nearestRows(const std::vector<Coord>& coords, const Eigen::Vector3d& centre,
                                  int64_t count);
 /// Their coordinates.
-std::vector<Coord> nearestOf(const std::vector<Coord>& coords, const Eigen::Vector3d& centre, int64_t count);
+std::vector<Coord> nearestOf(const std::vector<Coord>& coords, const Eigen::Vector3d& centre,
+                             int64_t count);
 
 /// Parts of at most `size`, about equal, of tokens that lie together.
 std::vector<std::vector<Coord>> chunksOf(const std::vector<Coord>& tokens, int64_t size);

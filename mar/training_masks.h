@@ -10,7 +10,8 @@ struct CoarseMask {
   std::vector<Coord> visible;  // filled in truth
   std::vector<Coord> targets;  // the rest, whatever it is; the loss is on these
 };
-/// Half of the masks hide everything, which is what inference asks; half a random .5-1 of the truth.
+/// Half of the masks hide everything, which is what inference asks; half a random .5-1 of the
+/// truth.
 CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const NodeStates& truth,
                           torch::Generator& random);
 
@@ -22,15 +23,15 @@ struct FineMask {
   std::vector<Coord> frontier;       // asked next: one BFS level, or one step from what is visible
   std::vector<Coord> others;         // hidden, or visited and rejected
 };
-/// Three quarters show nothing but the condition tokens and ask about one BFS level, any of them, which
-/// is what growth does; an eighth are growth states that see what they made (BFS depth 0-5), an eighth
-/// hide a random .5-1 of the truth.
-FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& sample, double false_positives,
-                      torch::Generator& random);
+/// Three quarters show nothing but the condition tokens and ask about one BFS level, any of them,
+/// which is what growth does; an eighth are growth states that see what they made (BFS depth 0-5),
+/// an eighth hide a random .5-1 of the truth.
+FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& sample,
+                      double false_positives, torch::Generator& random);
 
-/// Bounds of a larger volume around the sample's, or of a window cut from it: each side moves by up to 2.8 m
-/// outwards or a quarter of its length inwards, in whole coarse nodes, to at most 16 m. Half of the draws, and those that
-/// would hold nothing filled, are the sample's own.
+/// Bounds of a larger volume around the sample's, or of a window cut from it: each side moves by up
+/// to 2.8 m outwards or a quarter of its length inwards, in whole coarse nodes, to at most 16 m.
+/// Half of the draws, and those that would hold nothing filled, are the sample's own.
 CoordBBox drawBounds(const CompletionSample& sample, torch::Generator& random);
 
 }  // namespace vdbc

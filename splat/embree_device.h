@@ -4,8 +4,9 @@
 
 namespace vdbc {
 
-/// Making one costs milliseconds and it holds no scene data. Scenes keep a reference to their device, so the
-/// order of destruction at exit does not matter. Throws Error where Embree cannot start.
+/// Making one costs milliseconds and it holds no scene data. Scenes keep a reference to their
+/// device, so the order of destruction at exit does not matter. Throws Error where Embree cannot
+/// start.
 RTCDevice embreeDevice();
 
 }  // namespace vdbc

@@ -30,7 +30,7 @@ constexpr float kMaxLogit = 15.f;  // 3DGS tools take the sigmoid in float
 // What other programs call the opacity-compensated low pass, and its absence.
 constexpr const char *kAntialiasedMode = "mip", *kDefaultMode = "default";
 constexpr const char* kModeKey = "splat_render_mode";  // in a grid's metadata
-constexpr int kMaxShSlots = 16;    // of GS_SPH_R in files by others: room for degree 3
+constexpr int kMaxShSlots = 16;  // of GS_SPH_R in files by others: room for degree 3
 
 bool isFinite(const Gaussians& g, int64_t i) {
   const size_t n = size_t(g.shCoefficients()) * 3, row = size_t(i);
@@ -342,9 +342,8 @@ bool fitHalf(const Gaussians& g, const std::vector<int64_t>& rows) {
   });
 }
 
-void fillLeaf(const Gaussians& g, const Provenance& provenance,
-              const std::vector<int64_t>& sorted, const LeafRows& range,
-              const openvdb::math::Transform& transform) {
+void fillLeaf(const Gaussians& g, const Provenance& provenance, const std::vector<int64_t>& sorted,
+              const LeafRows& range, const openvdb::math::Transform& transform) {
   PointLeaf& leaf = *range.leaf;
   auto position = writeHandle<Vec3f, PositionCodec>(leaf, "P");
   openvdb::points::AttributeWriteHandle<Vec3f> scale(leaf.attributeArray("scale"));
@@ -690,11 +689,10 @@ void writePointsVdb(const Gaussians& g, const Provenance& provenance, const std:
     grid->setName("splats");
     grid->setCreator("vdb_complete");
     grid->insertMeta("point_count", openvdb::Int64Metadata(int64_t(rows.size())));
-    grid->insertMeta("point_attributes",
-                     openvdb::StringMetadata(joinText(
-                         "P scale orient GS_Alpha Cd ",
-                         g.sh_degree > 0 ? "GS_SPH_R GS_SPH_G GS_SPH_B " : "",
-                         "probability group:completed")));
+    grid->insertMeta("point_attributes", openvdb::StringMetadata(joinText(
+                                             "P scale orient GS_Alpha Cd ",
+                                             g.sh_degree > 0 ? "GS_SPH_R GS_SPH_G GS_SPH_B " : "",
+                                             "probability group:completed")));
     grid->insertMeta("sh_degree", openvdb::Int32Metadata(g.sh_degree));
     grid->insertMeta(kModeKey,
                      openvdb::StringMetadata(g.antialias ? kAntialiasedMode : kDefaultMode));

@@ -15,9 +15,9 @@ namespace vdbc {
 void writePly(const Gaussians& gaussians, const std::string& path,
               const Eigen::Vector3f& up = Eigen::Vector3f::Zero());
 /// Reads INRIA-like PLY by any conforming writer: any property order, normals and f_rest optional.
-/// Gaussians with NaN or Inf are dropped, quaternions stay as they are. Comments `SplatRenderMode: mip`
-/// and `antialiased 1` make them antialiased.
-/// Throws Error on anything else: truncated, no splat properties, compressed PLY, lists, ASCII.
+/// Gaussians with NaN or Inf are dropped, quaternions stay as they are. Comments `SplatRenderMode:
+/// mip` and `antialiased 1` make them antialiased. Throws Error on anything else: truncated, no
+/// splat properties, compressed PLY, lists, ASCII.
 Gaussians readPly(const std::string& path);
 
 /// Per-Gaussian provenance that only the VDB points file carries (decision 4 of the design).
@@ -28,12 +28,13 @@ struct Provenance {
 };
 
 /// One points grid `splats`: P fixed point 16 bit, scale vec3s (half, if all sigmas are within its
-/// normal range, else 16 significant bits), orient quats (x y z w, 16 significant bits), GS_Alpha, Cd
-/// scene-linear half, GS_SPH_R/G/B half[(degree + 1)^2] (not for degree 0: Cd is all its colour),
-/// `probability`, group `completed` (generated ones). Metadata: counts, `sh_degree`,
-/// `splat_render_mode` (`mip` if antialiased, or `default`). Voxel size is chosen for about 8 points a
-/// voxel. Points are sorted by voxel, so the order of Gaussians is not kept. Empty provenance means
-/// observed, 1. Drops and normalises as writePly() does. Temporary name, then rename. Throws Error.
+/// normal range, else 16 significant bits), orient quats (x y z w, 16 significant bits), GS_Alpha,
+/// Cd scene-linear half, GS_SPH_R/G/B half[(degree + 1)^2] (not for degree 0: Cd is all its
+/// colour), `probability`, group `completed` (generated ones). Metadata: counts, `sh_degree`,
+/// `splat_render_mode` (`mip` if antialiased, or `default`). Voxel size is chosen for about 8
+/// points a voxel. Points are sorted by voxel, so the order of Gaussians is not kept. Empty
+/// provenance means observed, 1. Drops and normalises as writePly() does. Temporary name, then
+/// rename. Throws Error.
 void writePointsVdb(const Gaussians& gaussians, const Provenance& provenance,
                     const std::string& path);
 /// Reads the points grid `splats` (or else the first points grid) with attributes P, scale, orient,

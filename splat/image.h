@@ -26,8 +26,8 @@ struct Image {
 float srgbFromLinear(float linear);
 float linearFromSrgb(float srgb);
 
-/// 8- or 16-bit PNG or 8-bit JPEG as values 0-1 (no transfer applied): 1, 3 channels (alpha dropped).
-/// Throws Error on missing, corrupt or oversized files (more than 2^28 pixels).
+/// 8- or 16-bit PNG or 8-bit JPEG as values 0-1 (no transfer applied): 1, 3 channels (alpha
+/// dropped). Throws Error on missing, corrupt or oversized files (more than 2^28 pixels).
 Image readImage(const std::string& path);
 /// 16-bit greyscale PNG as raw integers (depth in millimetres, say). Throws Error.
 std::vector<uint16_t> readPng16(const std::string& path, int* width, int* height);
@@ -45,8 +45,8 @@ void pasteImage(const Image& from, int x, int y, Image* to);
 /// 10 log10(1 / mean squared error) over all values; infinity for equal images. Values are 0-1.
 double psnr(const Image& a, const Image& b);
 /// SSIM of each window and channel (Wang et al. 2004): 11 x 11 Gaussian window, sigma 1.5, K1 .01,
-/// K2 .03, range 1, windows inside the image only: [H - 10, W - 10, C], the first one's centre is pixel
-/// (kSsimBorder, kSsimBorder).
+/// K2 .03, range 1, windows inside the image only: [H - 10, W - 10, C], the first one's centre is
+/// pixel (kSsimBorder, kSsimBorder).
 constexpr int kSsimBorder = 5;
 Image ssimMap(const Image& a, const Image& b);
 /// Mean of ssimMap().

@@ -1,5 +1,6 @@
 #pragma once
-// Differentiable splatting of 3-D Gaussians on the CPU (Kerbl et al. 2023; EWA: Zwicker et al. 2002).
+// Differentiable splatting of 3-D Gaussians on the CPU (Kerbl et al. 2023; EWA: Zwicker et al.
+// 2002).
 #include <memory>
 
 #include "splat/gaussians.h"
@@ -10,13 +11,13 @@ namespace vdbc {
 
 struct RasterSettings {
   Eigen::Vector3f background = Eigen::Vector3f::Zero();  // display sRGB
-  float near_m = 0.05f;       // Gaussians whose centre is nearer are culled
-  float low_pass = 0.3f;      // pixel variance added to the 2-D covariance, as in 3DGS
+  float near_m = 0.05f;         // Gaussians whose centre is nearer are culled
+  float low_pass = 0.3f;        // pixel variance added to the 2-D covariance, as in 3DGS
   float min_alpha = 1.f / 255;  // contributions below are skipped
   float max_alpha = 0.99f;
-  /// Opacity times sqrt(det cov / det (cov + low_pass I)), cov the 2-D covariance: what the low-pass
-  /// widens it also dims, so that thin and far Gaussians keep their weight (Yu et al. 2024,
-  /// Mip-Splatting, sec. 4.2).
+  /// Opacity times sqrt(det cov / det (cov + low_pass I)), cov the 2-D covariance: what the
+  /// low-pass widens it also dims, so that thin and far Gaussians keep their weight (Yu et al.
+  /// 2024, Mip-Splatting, sec. 4.2).
   bool antialias = false;
   bool median_depth = false;  // fill RasterOutput::median_depth
   int vector_bits = 0;  // 0: the widest registers of this CPU; 128, 256 or 512 to compare them
@@ -32,8 +33,8 @@ struct RasterOutput {
   Image colour;  // [H, W, 3] display sRGB over the background
   Image alpha;   // [H, W, 1]
   Image depth;   // [H, W, 1] expected planar depth, sum w z / sum w; 0 where alpha is 0
-  /// [H, W, 1] planar depth of the Gaussian at which transmittance falls to 0.5 or below; 0 where it
-  /// never does. Empty unless asked for.
+  /// [H, W, 1] planar depth of the Gaussian at which transmittance falls to 0.5 or below; 0 where
+  /// it never does. Empty unless asked for.
   Image median_depth;
   Image channels;  // [H, W, C] sum w value of the extra channels; empty without any
 };
@@ -45,9 +46,9 @@ struct RasterStateDeleter {
 };
 using RasterStatePtr = std::unique_ptr<RasterState, RasterStateDeleter>;
 
-/// Renders. With `saved`, keeps what rasterizeBackward needs. Tiles of 16 x 16 pixels, front to back,
-/// parallel over tiles; the same bytes for any number of threads. Degenerate Gaussians (NaN, zero
-/// quaternion, behind the camera) contribute nothing.
+/// Renders. With `saved`, keeps what rasterizeBackward needs. Tiles of 16 x 16 pixels, front to
+/// back, parallel over tiles; the same bytes for any number of threads. Degenerate Gaussians (NaN,
+/// zero quaternion, behind the camera) contribute nothing.
 RasterOutput rasterize(const Gaussians& gaussians, const Camera& camera,
                        const RasterSettings& settings, RasterStatePtr* saved = nullptr,
                        const ExtraChannels& extra = {});
@@ -57,7 +58,7 @@ struct RasterWork {
   int64_t visible = 0;    // Gaussians that may touch the image
   int64_t instances = 0;  // the same times the 16 x 16 tiles each is listed in
   int64_t blocks = 0;     // the same times the 4 x 4 blocks of each tile that look at it
-  int64_t pairs = 0;      // pixels and Gaussians that count: alpha >= min_alpha, pixel not opaque yet
+  int64_t pairs = 0;  // pixels and Gaussians that count: alpha >= min_alpha, pixel not opaque yet
 };
 RasterWork workOf(const RasterState& state);
 
@@ -80,8 +81,8 @@ struct BackwardExtras {
   bool camera = false;                    // fill GaussianGradients::camera
 };
 
-/// d_colour: [H, W, 3] derivative of the loss by RasterOutput::colour; d_alpha and d_depth ([H, W, 1])
-/// may be null. `gaussians` and `camera` are those of the forward call.
+/// d_colour: [H, W, 3] derivative of the loss by RasterOutput::colour; d_alpha and d_depth ([H, W,
+/// 1]) may be null. `gaussians` and `camera` are those of the forward call.
 GaussianGradients rasterizeBackward(const Gaussians& gaussians, const Camera& camera,
                                     const RasterState& saved, const Image& d_colour,
                                     const Image* d_alpha = nullptr, const Image* d_depth = nullptr,

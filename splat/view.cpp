@@ -283,7 +283,8 @@ Camera jsonCamera(const Keys& keys, int image_width, int image_height, const std
 std::optional<std::pair<int, int>> statedSize(const Keys& keys) {
   const auto w = keys.number("w"), h = keys.number("h");
   if (!w || !h) return {};
-  require(*w >= 1 && *h >= 1 && *w * *h <= double(kMaxPixels) && *w == std::floor(*w) && *h == std::floor(*h),
+  require(*w >= 1 && *h >= 1 && *w * *h <= double(kMaxPixels) && *w == std::floor(*w) &&
+              *h == std::floor(*h),
           kRead, ": ", keys.where, ": expected 1 to 2^28 pixels, found ", *w, " x ", *h);
   return std::pair(int(*w), int(*h));
 }
@@ -304,7 +305,8 @@ View readJsonFrame(const Json& json, size_t index, const Applied& applied, const
   const std::string image_path = imagePath(folder, *file_path);
   const auto size = settings.cameras_only ? statedSize(keys) : std::nullopt;
   if (!size) view.colour = threeChannels(readImage(image_path));
-  const int w = size ? size->first : view.colour.width, h = size ? size->second : view.colour.height;
+  const int w = size ? size->first : view.colour.width,
+            h = size ? size->second : view.colour.height;
   view.camera = jsonCamera(keys, w, h, image_path);
 
   const auto matrix = frame.find("transform_matrix");
@@ -649,8 +651,9 @@ Source findSource(const std::string& path) {
   } else if (extension == ".vdb") {
     source.volume = path;
   } else {
-    throw Error(joinText(kRead, ": ", path,
-                         ": expected a folder, a transforms.json, an .exr, an .npz or a .vdb file"));
+    throw Error(
+        joinText(kRead, ": ", path,
+                 ": expected a folder, a transforms.json, an .exr, an .npz or a .vdb file"));
   }
   return source;
 }
@@ -744,10 +747,11 @@ void writeViews(const std::vector<View>& views, const std::string& folder) {
   writeFile(kOperation, (fs::path(folder) / "transforms.json").string(), text.data(), text.size());
 }
 
-void writeExr(const Camera& camera, const std::vector<ExrChannel>& channels, const std::string& path) {
+void writeExr(const Camera& camera, const std::vector<ExrChannel>& channels,
+              const std::string& path) {
   constexpr const char* kOperation = "writeExr";
-  require(camera.width > 0 && camera.height > 0 && camera.fx > 0 && camera.fy > 0, kOperation, ": ", path,
-          ": expected a camera with pixels, found ", camera.width, " x ", camera.height);
+  require(camera.width > 0 && camera.height > 0 && camera.fx > 0 && camera.fy > 0, kOperation, ": ",
+          path, ": expected a camera with pixels, found ", camera.width, " x ", camera.height);
   const size_t w = size_t(camera.width), pixels = w * size_t(camera.height);
 
   // Axes x right, y up, z forward; NDC from (0, 0) upper left to (1, 1) lower right, z / w in [0,
@@ -781,15 +785,16 @@ void writeExr(const Camera& camera, const std::vector<ExrChannel>& channels, con
     header.channels().insert(c.name, Imf::Channel(c.is_half ? Imf::HALF : Imf::FLOAT));
     if (!c.is_half) {
       const size_t stride = c.stride * sizeof(float);
-      buffer.insert(c.name, Imf::Slice(Imf::FLOAT, reinterpret_cast<char*>(const_cast<float*>(c.values)),
-                                       stride, stride * w));
+      buffer.insert(c.name,
+                    Imf::Slice(Imf::FLOAT, reinterpret_cast<char*>(const_cast<float*>(c.values)),
+                               stride, stride * w));
       continue;
     }
     std::vector<half>& values = halves.emplace_back(pixels);
     for (size_t i = 0; i < pixels; ++i)
       values[i] = half(std::clamp(c.values[i * c.stride], -65504.f, 65504.f));
-    buffer.insert(c.name, Imf::Slice(Imf::HALF, reinterpret_cast<char*>(values.data()), sizeof(half),
-                                     sizeof(half) * w));
+    buffer.insert(c.name, Imf::Slice(Imf::HALF, reinterpret_cast<char*>(values.data()),
+                                     sizeof(half), sizeof(half) * w));
   }
   TemporaryFile temporary(kOperation, path);
   try {
@@ -809,7 +814,9 @@ void writeViewExr(const View& view, const std::string& path) {
   for (size_t i = 0; i < depth.size(); ++i)
     depth[i] = view.depth[i] > 0 && view.depth[i] < kFarDepth ? view.depth[i] : kNoDepth;
   writeExr(view.camera,
-           {{"R", linear.data(), 3, true}, {"G", linear.data() + 1, 3, true}, {"B", linear.data() + 2, 3, true},
+           {{"R", linear.data(), 3, true},
+            {"G", linear.data() + 1, 3, true},
+            {"B", linear.data() + 2, 3, true},
             {"Z", depth.data(), 1, false}},
            path);
 }

@@ -9,8 +9,8 @@
 
 namespace vdbc {
 
-/// A posed view. Pointmaps become planar depth when read (points that do not reproject within half a
-/// pixel of their own pixel are invalid), so there is one representation. Spec E1, E2.
+/// A posed view. Pointmaps become planar depth when read (points that do not reproject within half
+/// a pixel of their own pixel are invalid), so there is one representation. Spec E1, E2.
 struct View {
   std::string name;          // file name, for messages and contact sheets
   Camera camera;             // OpenCV axes, camera-to-world, metres
@@ -22,9 +22,10 @@ struct View {
 
 struct ReadViewsSettings {
   std::vector<int> frames;  // indices into the folder's frames; empty = all
-  int max_side = 0;         // shrink so that the longer side is at most this; 0 = as stored. Colour is
-                            // area-averaged, depth takes the nearest sample
-  bool cameras_only = false;  // colour and depth stay empty and need not be there; max_side is not heeded
+  int max_side = 0;  // shrink so that the longer side is at most this; 0 = as stored. Colour is
+                     // area-averaged, depth takes the nearest sample
+  bool cameras_only =
+      false;  // colour and depth stay empty and need not be there; max_side is not heeded
   double metres_per_unit = 0;  // of an .npz; 0 = from the file (PointmapScale), if it tells
 };
 
@@ -34,8 +35,8 @@ struct ReadViewsSettings {
 /// conversion beyond camera axes; a transforms.json's applied_transform and applied_scale are
 /// undone. 0 and 65535 in a 16-bit depth PNG are no measurement. Frames are read in parallel; the
 /// first bad frame's Error is thrown.
-/// Throws Error: no views, views without depth, mismatched sizes, corrupt files, frames out of range,
-/// distortion other than zero, singular or non-rigid poses, depth without one valid pixel, a
+/// Throws Error: no views, views without depth, mismatched sizes, corrupt files, frames out of
+/// range, distortion other than zero, singular or non-rigid poses, depth without one valid pixel, a
 /// pointmap of unknown scale, a scale for what is in metres already, a volume without surface or
 /// without free space for a camera.
 std::vector<View> readViews(const std::string& path, const ReadViewsSettings& settings = {});
@@ -71,7 +72,8 @@ constexpr float kNoDepth = 1e10f;
 
 /// One EXR with spec-conforming worldToCamera and worldToNDC. Temporary name, then rename. Throws
 /// Error.
-void writeExr(const Camera& camera, const std::vector<ExrChannel>& channels, const std::string& path);
+void writeExr(const Camera& camera, const std::vector<ExrChannel>& channels,
+              const std::string& path);
 
 /// One multi-channel EXR (half RGB scene-linear, float Z planar) with spec-conforming worldToCamera
 /// and worldToNDC; pixels without depth get 1e10. Temporary name, then rename. Throws Error.

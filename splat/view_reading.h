@@ -54,9 +54,9 @@ std::vector<View> readPointmaps(const std::string& path, const ReadViewsSettings
 /// Mean of the cameras' up axes.
 Eigen::Vector3d pointmapUp(const std::string& path);
 
-/// Up to 12 views of a .vdb's level set or fog volume by casting rays from cameras in its free space,
-/// the same ones each time (volume_views.cpp; docs/formats.md). Pixels that meet no surface have no
-/// depth. Throws Error also where there is no place for a camera.
+/// Up to 12 views of a .vdb's level set or fog volume by casting rays from cameras in its free
+/// space, the same ones each time (volume_views.cpp; docs/formats.md). Pixels that meet no surface
+/// have no depth. Throws Error also where there is no place for a camera.
 std::vector<View> readVolumeViews(const std::string& path, const ReadViewsSettings& settings);
 /// What is up in the volume's world by the program that wrote it.
 Eigen::Vector3d volumeUp(const std::string& path);

@@ -36,21 +36,22 @@ constexpr int kViewSide = 224;  // pixels
 constexpr double kFieldOfView = 75 * M_PI / 180;
 constexpr double kClearanceM = 0.3;  // of cameras from surfaces
 constexpr int kAttempts = 8192, kMaxPlaces = 192;
-constexpr int kScanRays = 1024;  // from each place, to see what it sees
-constexpr int kLooks = 32;       // directions a camera may look in
+constexpr int kScanRays = 1024;         // from each place, to see what it sees
+constexpr int kLooks = 32;              // directions a camera may look in
 constexpr double kSceneryPatches = 24;  // a patch's edge is the scene's diagonal over this
 constexpr double kOpenShare = 0.5;  // a place that sees less than this share of what the best place
                                     // sees is not used: outside of a room, or beside a cut
 
-/// What cannot be free space: a field whose sign tells inside from outside, and what is known of it.
+/// What cannot be free space: a field whose sign tells inside from outside, and what is known of
+/// it.
 struct Volume {
   FloatGrid::Ptr field;
   bool is_level_set = false;
   double unit = 1;  // of field values: metres a voxel (level set), the value of the surface (fog)
   double voxel_m = 0;
   Eigen::Affine3d world_from_index, index_from_world;
-  MaskTree::Ptr cells;  // ijk: the cube [ijk, ijk + 1] between samples, where the sign changes
-  CoordBBox bounds;     // of the cells
+  MaskTree::Ptr cells;    // ijk: the cube [ijk, ijk + 1] between samples, where the sign changes
+  CoordBBox bounds;       // of the cells
   Vec3SGrid::Ptr colour;  // scene-linear, may be null
   Eigen::Affine3d colour_from_world;
   BoolGrid::Ptr seen_empty;  // with the field's transform, may be null
@@ -64,21 +65,26 @@ struct Volume {
 FloatGrid::Ptr geometryGrid(const openvdb::GridPtrVec& grids, const std::string& path) {
   const auto first = [&](const auto& fits) -> FloatGrid::Ptr {
     for (const auto& grid : grids)
-      if (grid && grid->isType<FloatGrid>() && fits(*grid)) return openvdb::gridPtrCast<FloatGrid>(grid);
+      if (grid && grid->isType<FloatGrid>() && fits(*grid))
+        return openvdb::gridPtrCast<FloatGrid>(grid);
     return nullptr;
   };
-  FloatGrid::Ptr found = first([](const auto& g) { return g.getGridClass() == openvdb::GRID_LEVEL_SET; });
+  FloatGrid::Ptr found =
+      first([](const auto& g) { return g.getGridClass() == openvdb::GRID_LEVEL_SET; });
   if (!found) found = first([](const auto& g) { return g.getName() == "density"; });
-  if (!found) found = first([](const auto& g) { return g.getGridClass() == openvdb::GRID_FOG_VOLUME; });
+  if (!found)
+    found = first([](const auto& g) { return g.getGridClass() == openvdb::GRID_FOG_VOLUME; });
   std::set<std::string> types;
   for (const auto& grid : grids)
     if (grid) types.insert(grid->type());
   std::string listed;
   for (const std::string& type : types) listed += " " + type;
-  require(bool(found), kReadViews, ": ", path, ": nothing to look at (expected a float grid that is a level set, ",
+  require(bool(found), kReadViews, ": ", path,
+          ": nothing to look at (expected a float grid that is a level set, ",
           "a fog volume or named density, found", listed.empty() ? " no grids" : listed, ")");
   require(!found->tree().empty(), kReadViews, ": ", path, ": its ",
-          found->getGridClass() == openvdb::GRID_LEVEL_SET ? "level set" : "fog volume", " is empty");
+          found->getGridClass() == openvdb::GRID_LEVEL_SET ? "level set" : "fog volume",
+          " is empty");
   return found;
 }
 
@@ -96,15 +102,16 @@ Eigen::Affine3d worldFromIndex(const openvdb::math::Transform& transform, const 
     world_from_index.linear().col(axis) << step.x(), step.y(), step.z();
     world_from_index.translation()[axis] = origin[axis];
   }
-  require(world_from_index.matrix().allFinite(), kReadViews, ": ", path, ": its transform is not finite");
+  require(world_from_index.matrix().allFinite(), kReadViews, ": ", path,
+          ": its transform is not finite");
   const Matrix3d& linear = world_from_index.linear();
   const double edge = std::cbrt(linear.determinant());
-  require(edge >= kMinVoxelM && edge <= kMaxVoxelM, kReadViews, ": ", path, ": expected voxels of ", kMinVoxelM,
-          " to ", kMaxVoxelM, " m that are not mirrored, found ", edge, " m");
+  require(edge >= kMinVoxelM && edge <= kMaxVoxelM, kReadViews, ": ", path, ": expected voxels of ",
+          kMinVoxelM, " to ", kMaxVoxelM, " m that are not mirrored, found ", edge, " m");
   const Matrix3d r = linear / edge;
   const double shear = (r.transpose() * r - Matrix3d::Identity()).cwiseAbs().maxCoeff();
-  require(shear <= kMaxShear, kReadViews, ": ", path, ": expected cubic voxels, found ", linear.col(0).norm(), " x ",
-          linear.col(1).norm(), " x ", linear.col(2).norm(), " m");
+  require(shear <= kMaxShear, kReadViews, ": ", path, ": expected cubic voxels, found ",
+          linear.col(0).norm(), " x ", linear.col(1).norm(), " x ", linear.col(2).norm(), " m");
   return world_from_index;
 }
 
@@ -126,11 +133,12 @@ std::vector<Coord> blockOrigins(const FloatTree& tree, const std::string& path) 
   const auto count = [&](const CoordBBox& box) {
     extent.expand(box);
     blocks += box.volume() / (kDim * kDim * kDim);
-    require(blocks <= kMaxBlocks, kReadViews, ": ", path, ": too large (expected at most ", kMaxBlocks,
-            " blocks of 8 x 8 x 8 voxels)");
+    require(blocks <= kMaxBlocks, kReadViews, ": ", path, ": too large (expected at most ",
+            kMaxBlocks, " blocks of 8 x 8 x 8 voxels)");
   };
   std::vector<CoordBBox> boxes;
-  for (auto leaf = tree.cbeginLeaf(); leaf; ++leaf) boxes.push_back(leaf->getNodeBoundingBox()), count(boxes.back());
+  for (auto leaf = tree.cbeginLeaf(); leaf; ++leaf)
+    boxes.push_back(leaf->getNodeBoundingBox()), count(boxes.back());
   auto tile = tree.cbeginValueOn();
   tile.setMaxDepth(FloatTree::ValueOnCIter::LEAF_DEPTH - 1);
   for (; tile; ++tile) {
@@ -139,13 +147,15 @@ std::vector<Coord> blockOrigins(const FloatTree& tree, const std::string& path) 
   }
   require(blocks > 0, kReadViews, ": ", path, ": its grid is empty");
   for (int axis = 0; axis < 3; ++axis)
-    require(extent.min()[axis] >= -kMaxVolumeIndex && extent.max()[axis] <= kMaxVolumeIndex, kReadViews, ": ", path,
-            ": expected voxels within ", kMaxVolumeIndex, " of the grid's origin, found ", extent);
+    require(extent.min()[axis] >= -kMaxVolumeIndex && extent.max()[axis] <= kMaxVolumeIndex,
+            kReadViews, ": ", path, ": expected voxels within ", kMaxVolumeIndex,
+            " of the grid's origin, found ", extent);
   std::vector<Coord> origins;
   for (const CoordBBox& box : boxes)
     for (int x = box.min().x() - kDim; x <= box.max().x(); x += kDim)
       for (int y = box.min().y() - kDim; y <= box.max().y(); y += kDim)
-        for (int z = box.min().z() - kDim; z <= box.max().z(); z += kDim) origins.emplace_back(x, y, z);
+        for (int z = box.min().z() - kDim; z <= box.max().z(); z += kDim)
+          origins.emplace_back(x, y, z);
   std::sort(origins.begin(), origins.end());
   origins.erase(std::unique(origins.begin(), origins.end()), origins.end());
   return origins;
@@ -174,7 +184,8 @@ void findSurface(Volume* volume, const std::string& path) {
       const Coord p = Leaf::offsetToLocalCoord(offset);
       int corners = 0;
       for (int c = 0; c < 8; ++c)
-        corners += solid[size_t(((p.x() + (c >> 2)) * kSide + p.y() + (c >> 1 & 1)) * kSide + p.z() + (c & 1))];
+        corners += solid[size_t(((p.x() + (c >> 2)) * kSide + p.y() + (c >> 1 & 1)) * kSide +
+                                p.z() + (c & 1))];
       if (corners > 0 && corners < 8) leaf->setValueOn(offset);
     }
     if (!leaf->isEmpty()) leaves[i] = leaf.release();
@@ -184,12 +195,14 @@ void findSurface(Volume* volume, const std::string& path) {
     if (leaf) volume->cells->addLeaf(leaf);
   require(finite, kReadViews, ": ", path, ": its grid has values that are not finite");
   require(volume->cells->evalActiveVoxelBoundingBox(volume->bounds), kReadViews, ": ", path,
-          ": no surface (expected values at both sides of ", volume->is_level_set ? 0 : volume->unit, ")");
+          ": no surface (expected values at both sides of ",
+          volume->is_level_set ? 0 : volume->unit, ")");
 }
 
-/// Where up is in the world of a volume: +Z of the grid in our own files, which are turned so; +Y of
-/// Houdini's files; +Z of all others.
-Vector3d upOf(const VdbFile& file, const FloatGrid& field, const Eigen::Affine3d& world_from_index) {
+/// Where up is in the world of a volume: +Z of the grid in our own files, which are turned so; +Y
+/// of Houdini's files; +Z of all others.
+Vector3d upOf(const VdbFile& file, const FloatGrid& field,
+              const Eigen::Affine3d& world_from_index) {
   if (field.getCreator() == "vdb_complete") return world_from_index.linear().col(2).normalized();
   const auto creator = file.metadata.getMetadata<openvdb::StringMetadata>("creator");
   const bool houdini = creator && creator->value().rfind("Houdini", 0) == 0;
@@ -208,7 +221,8 @@ Volume loadVolume(const std::string& path) {
   v.unit = v.is_level_set ? v.voxel_m : fogSurface(v.field->tree(), path);
   v.up = upOf(file, *v.field, v.world_from_index);
   const auto has = [&](const char* name) {
-    return std::any_of(file.grids.begin(), file.grids.end(), [&](const auto& g) { return g && g->getName() == name; });
+    return std::any_of(file.grids.begin(), file.grids.end(),
+                       [&](const auto& g) { return g && g->getName() == name; });
   };
   if (has("Cd")) {
     v.colour = findGrid<Vec3SGrid>(kReadViews, file.grids, "Cd", path);
@@ -219,8 +233,9 @@ Volume loadVolume(const std::string& path) {
   }
   if (has("seen_empty")) {
     v.seen_empty = findGrid<BoolGrid>(kReadViews, file.grids, "seen_empty", path);
-    require(worldFromIndex(v.seen_empty->transform(), path).isApprox(v.world_from_index, 1e-6), kReadViews, ": ", path,
-            ": grid 'seen_empty' has another transform than '", v.field->getName(), "'");
+    require(worldFromIndex(v.seen_empty->transform(), path).isApprox(v.world_from_index, 1e-6),
+            kReadViews, ": ", path, ": grid 'seen_empty' has another transform than '",
+            v.field->getName(), "'");
   }
   return v;
 }
@@ -231,13 +246,18 @@ openvdb::Vec3d vdbVector(const Vector3d& v) { return {v.x(), v.y(), v.z()}; }
 class RayCaster {
  public:
   explicit RayCaster(const Volume& volume)
-      : volume_(volume), values_(volume.field->tree()), cells_(*volume.cells),
-        box_(volume.bounds.min().asVec3d() - openvdb::Vec3d(1), volume.bounds.max().asVec3d() + openvdb::Vec3d(2)) {}
+      : volume_(volume),
+        values_(volume.field->tree()),
+        cells_(*volume.cells),
+        box_(volume.bounds.min().asVec3d() - openvdb::Vec3d(1),
+             volume.bounds.max().asVec3d() + openvdb::Vec3d(2)) {}
 
-  /// How many times `direction` (world) from `origin`, in free space, the surface is met. 0 where the
-  /// ray meets none, or enters the solid of a level set where that was cut: there is no surface.
+  /// How many times `direction` (world) from `origin`, in free space, the surface is met. 0 where
+  /// the ray meets none, or enters the solid of a level set where that was cut: there is no
+  /// surface.
   double cast(const Vector3d& origin, const Vector3d& direction) const {
-    Ray ray(vdbVector(volume_.index_from_world * origin), vdbVector(volume_.index_from_world.linear() * direction), 0);
+    Ray ray(vdbVector(volume_.index_from_world * origin),
+            vdbVector(volume_.index_from_world.linear() * direction), 0);
     if (!ray.clip(box_)) return 0;
     openvdb::math::DDA<Ray, MaskTree::LeafNodeType::LOG2DIM> blocks(ray);
     do {
@@ -258,19 +278,20 @@ class RayCaster {
  private:
   using Ray = openvdb::math::Ray<double>;
 
-  /// Whether the ray is in the solid at some time of [t0, t1], which it spends in `cell`; then `t` is
-  /// what cast() returns. The field is trilinear between the samples.
+  /// Whether the ray is in the solid at some time of [t0, t1], which it spends in `cell`; then `t`
+  /// is what cast() returns. The field is trilinear between the samples.
   bool entersSolid(const Ray& ray, const Coord& cell, double t0, double t1, double* t) const {
     constexpr double kDeep = 1e-2;  // no rounding reaches that far behind the surface
     std::array<double, 8> corners;
     for (int c = 0; c < 8; ++c)
-      corners[size_t(c)] = volume_.height(values_.getValue(cell.offsetBy(c >> 2, c >> 1 & 1, c & 1)));
+      corners[size_t(c)] =
+          volume_.height(values_.getValue(cell.offsetBy(c >> 2, c >> 1 & 1, c & 1)));
     const auto height = [&](double time) {
       const openvdb::Vec3d p = ray(time) - cell.asVec3d();
       double sum = 0;
       for (int c = 0; c < 8; ++c)
-        sum += corners[size_t(c)] * (c >> 2 ? p.x() : 1 - p.x()) * (c >> 1 & 1 ? p.y() : 1 - p.y()) *
-               (c & 1 ? p.z() : 1 - p.z());
+        sum += corners[size_t(c)] * (c >> 2 ? p.x() : 1 - p.x()) *
+               (c >> 1 & 1 ? p.y() : 1 - p.y()) * (c & 1 ? p.z() : 1 - p.z());
       return sum;
     };
     const double first = height(t0);
@@ -314,7 +335,8 @@ class ColourLookup {
     constexpr float kGrey = 0.5f;  // without colour
     if (!colours_) return Eigen::Vector3f::Constant(kGrey);
     const Vector3d p = volume_.colour_from_world * p_world;
-    if (!(p.cwiseAbs().maxCoeff() < kMaxVolumeIndex)) return Eigen::Vector3f::Constant(kGrey);  // no such index
+    if (!(p.cwiseAbs().maxCoeff() < kMaxVolumeIndex))
+      return Eigen::Vector3f::Constant(kGrey);  // no such index
     const Coord centre = Coord::round(vdbVector(p));
     if (colours_->isValueOn(centre)) return display(centre);
     double best = std::numeric_limits<double>::max();
@@ -324,7 +346,8 @@ class ColourLookup {
       const double distance = (ijk.asVec3d() - vdbVector(p)).lengthSqr();
       if (distance < best) best = distance, nearest = ijk;
     }
-    return best < std::numeric_limits<double>::max() ? display(nearest) : Eigen::Vector3f::Constant(kGrey);
+    return best < std::numeric_limits<double>::max() ? display(nearest)
+                                                     : Eigen::Vector3f::Constant(kGrey);
   }
 
  private:
@@ -352,7 +375,8 @@ std::vector<Vector3d> freePlaces(const Volume& volume) {
   };
   MaskTree blocks;
   openvdb::tree::ValueAccessor<MaskTree, false> block(blocks);
-  for (auto cell = volume.cells->cbeginValueOn(); cell; ++cell) block.setValueOn(blockOf(cell.getCoord()));
+  for (auto cell = volume.cells->cbeginValueOn(); cell; ++cell)
+    block.setValueOn(blockOf(cell.getCoord()));
   const auto isClear = [&](const openvdb::Vec3d& p) {
     const Coord centre = blockOf(Coord::floor(p));
     const int reach = int(clearance / edge) + 1;
@@ -375,7 +399,8 @@ std::vector<Vector3d> freePlaces(const Volume& volume) {
   for (int i = 0; i < kAttempts && places.size() < kMaxPlaces; ++i) {
     openvdb::Vec3d p;
     for (int axis = 0; axis < 3; ++axis)
-      p[axis] = volume.bounds.min()[axis] + double(random() >> 11) * 0x1p-53 * volume.bounds.dim()[axis];
+      p[axis] =
+          volume.bounds.min()[axis] + double(random() >> 11) * 0x1p-53 * volume.bounds.dim()[axis];
     // Clear of the surface, all corners of the point's cell are at its side.
     if (!caster.isFree(Coord::floor(p)) || !isClear(p)) continue;
     if (volume.seen_empty && !volume.seen_empty->tree().isValueOn(Coord::round(p))) continue;
@@ -436,7 +461,8 @@ std::vector<Candidate> candidates(const Volume& volume, const std::vector<Vector
     const Camera camera = cameraAt(Vector3d::Zero(), looks[j], volume.up);
     for (size_t r = 0; r < rays.size(); ++r) {
       const Vector3d p = camera.project(rays[r]);
-      if (p.z() > 0 && p.x() >= 0 && p.x() <= kViewSide && p.y() >= 0 && p.y() <= kViewSide) within[j].push_back(r);
+      if (p.z() > 0 && p.x() >= 0 && p.x() <= kViewSide && p.y() >= 0 && p.y() <= kViewSide)
+        within[j].push_back(r);
     }
   }
   std::map<Coord, int> numbers;
@@ -460,9 +486,9 @@ std::vector<Candidate> candidates(const Volume& volume, const std::vector<Vector
 std::vector<Camera> chooseCameras(const Volume& volume, const std::string& path) {
   constexpr double kSeenAgain = 0.25;  // what a patch is worth with each view that has it
   std::vector<Candidate> all = candidates(volume, freePlaces(volume));
-  require(!all.empty(), kReadViews, ": ", path, ": no free place for a camera (expected room ", kClearanceM,
-          " m from surfaces that can be seen, inside their box", volume.seen_empty ? " and seen_empty" : "",
-          "; units are metres)");
+  require(!all.empty(), kReadViews, ": ", path, ": no free place for a camera (expected room ",
+          kClearanceM, " m from surfaces that can be seen, inside their box",
+          volume.seen_empty ? " and seen_empty" : "", "; units are metres)");
   int last = 0;
   for (const Candidate& c : all) last = std::max(last, c.patches.back());
   std::vector<double> worth(size_t(last) + 1, 1);

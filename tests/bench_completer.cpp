@@ -1,7 +1,8 @@
-// What keeping H1's output between growth levels would save (docs/performance.md). Generated tokens are no context, so what
-// H1 says of a chunk's context could be kept, if the chunks of all levels had the same contexts: those of tree nodes.
-// completer/h1 and completer/h2/TARGETS time one chunk of the shipped weights; completer/chunks/SIDE counts, for the bundled
-// views, H1 and H2 calls with contexts by chunk (SIDE 0: as it is) and by tree node of SIDE tokens.
+// What keeping H1's output between growth levels would save (docs/performance.md). Generated tokens
+// are no context, so what H1 says of a chunk's context could be kept, if the chunks of all levels
+// had the same contexts: those of tree nodes. completer/h1 and completer/h2/TARGETS time one chunk
+// of the shipped weights; completer/chunks/SIDE counts, for the bundled views, H1 and H2 calls with
+// contexts by chunk (SIDE 0: as it is) and by tree node of SIDE tokens.
 #include <benchmark/benchmark.h>
 
 #include <set>
@@ -19,14 +20,16 @@ CompleterNet& network() {
   static const std::shared_ptr<CompleterNet> net = [] {
     const std::string path = kWeights + "/completer.safetensors";
     const TensorFile file = readTensors(path);
-    auto loaded = std::make_shared<CompleterNet>(CompleterConfig::fromJson(file.metadata.at("completer"), path));
+    auto loaded = std::make_shared<CompleterNet>(
+        CompleterConfig::fromJson(file.metadata.at("completer"), path));
     loadModule(*loaded, "", file, path);
     return loaded;
   }();
   return *net;
 }
 
-void timeBlocks(benchmark::State& state, const std::vector<std::shared_ptr<SelfBlock>>& blocks, int64_t tokens) {
+void timeBlocks(benchmark::State& state, const std::vector<std::shared_ptr<SelfBlock>>& blocks,
+                int64_t tokens) {
   const torch::NoGradGuard no_grad;
   torch::set_num_threads(1);
   const CompleterConfig& c = network().config;
@@ -42,7 +45,9 @@ void timeBlocks(benchmark::State& state, const std::vector<std::shared_ptr<SelfB
 int64_t contextTokens() { return network().config.context_tokens + network().config.empty_tokens; }
 
 void h1(benchmark::State& state) { timeBlocks(state, network().trunk->h1, contextTokens()); }
-void h2(benchmark::State& state) { timeBlocks(state, network().trunk->h2, contextTokens() + state.range(0)); }
+void h2(benchmark::State& state) {
+  timeBlocks(state, network().trunk->h2, contextTokens() + state.range(0));
+}
 
 // Candidates of the bundled views and their growth levels.
 struct Growth {
@@ -54,10 +59,11 @@ const Growth& bundledGrowth() {
     const torch::NoGradGuard no_grad;
     Progress silent;
     const Encoder encoder(kWeights + "/encoder.safetensors");
-    const Encoding e = encodeScene(readViews(VDBC_SOURCE_DIR "/examples/two_views"), encoder, {}, silent);
+    const Encoding e =
+        encodeScene(readViews(VDBC_SOURCE_DIR "/examples/two_views"), encoder, {}, silent);
     const VoxelFrame& frame = e.latents.frame;
-    const SceneTokens scene =
-        sceneTokens(poolStates(frame, e.observation.space, 1), poolStates(frame, e.observation.space, 2));
+    const SceneTokens scene = sceneTokens(poolStates(frame, e.observation.space, 1),
+                                          poolStates(frame, e.observation.space, 2));
     std::map<Coord, float> gate;
     for (const Coord& c : scene.coarse_filled) gate[c] = 1;
     network().coarseProbabilities(scene, scene.coarse_unknown, frame, &gate);
@@ -94,7 +100,13 @@ void chunks(benchmark::State& state) {
 }
 
 BENCHMARK(h1)->Name("completer/h1")->Unit(benchmark::kMillisecond);
-BENCHMARK(h2)->Name("completer/h2")->Arg(20)->Arg(40)->Arg(80)->Arg(160)->Unit(benchmark::kMillisecond);
+BENCHMARK(h2)
+    ->Name("completer/h2")
+    ->Arg(20)
+    ->Arg(40)
+    ->Arg(80)
+    ->Arg(160)
+    ->Unit(benchmark::kMillisecond);
 BENCHMARK(chunks)->Name("completer/chunks")->Arg(0)->Arg(8)->Arg(16)->Arg(32)->Iterations(1);
 
 }  // namespace

@@ -41,7 +41,8 @@ TEST(Cameras, SameSeedSameCameras) {
   const Room room = simpleRoom(2);
   const RayTarget solid = solidOf(room);
   std::mt19937_64 a(9), b(9);
-  const auto first = randomCameras(room, solid, 5, 40, 30, a), second = randomCameras(room, solid, 5, 40, 30, b);
+  const auto first = randomCameras(room, solid, 5, 40, 30, a),
+             second = randomCameras(room, solid, 5, 40, 30, b);
   for (size_t i = 0; i < 5; ++i)
     EXPECT_EQ(first[i].world_from_camera.matrix(), second[i].world_from_camera.matrix());
 }

@@ -223,8 +223,10 @@ TEST(EncoderGuide, MemoryGrowsWithTheCountedPairs) {  // E7: never [N, M]
   const int64_t n = 3000, m = 50000;
   for (size_t pairs : {100u, 1000u, 10000u}) {
     std::vector<int32_t> rows, columns;
-    for (size_t k = 0; k < pairs; ++k) rows.push_back(int32_t(k % n)), columns.push_back(int32_t(k * 7 % m));
-    const CountAttention a = countAttention(rows, columns, std::vector<float>(pairs, 2), n, m, false);
+    for (size_t k = 0; k < pairs; ++k)
+      rows.push_back(int32_t(k % n)), columns.push_back(int32_t(k * 7 % m));
+    const CountAttention a =
+        countAttention(rows, columns, std::vector<float>(pairs, 2), n, m, false);
     size_t bytes = 0;
     for (const Tensor& t : {a.rows, a.columns, a.weight, a.floor}) bytes += t.storage().nbytes();
     EXPECT_EQ(bytes, pairs * (8 + 8 + 4) + size_t(n) * 4);
@@ -454,8 +456,8 @@ TEST(EncoderNet, GaussiansStayNearTheirSubLattice) {  // E11
     const std::vector<Coord> voxels = scatteredCoords(20);
     const float h = .2f;
     const int64_t m = int64_t(per_axis) * per_axis * per_axis;
-    const GaussianTensors g =
-        net->gaussians({torch::randn({20, c.voxel_width}), torch::randn({20, 8, 3})}, coordTensor(voxels), h);
+    const GaussianTensors g = net->gaussians(
+        {torch::randn({20, c.voxel_width}), torch::randn({20, 8, 3})}, coordTensor(voxels), h);
     ASSERT_EQ(g.mean.sizes(), (std::vector<int64_t>{20 * m, 3}));
     ASSERT_EQ(g.sh.sizes(), (std::vector<int64_t>{20 * m, 1, 3}));
     double farthest = 0;
@@ -482,12 +484,14 @@ TEST(EncoderNet, AnyNumberOfGaussiansSharesTheLattice) {  // E11: M
     ASSERT_EQ(lattice.sizes(), (std::vector<int64_t>{m, 3}));
     std::set<std::array<float, 3>> places;
     for (int64_t i = 0; i < m; ++i)
-      places.insert({lattice[i][0].item<float>(), lattice[i][1].item<float>(), lattice[i][2].item<float>()});
+      places.insert(
+          {lattice[i][0].item<float>(), lattice[i][1].item<float>(), lattice[i][2].item<float>()});
     EXPECT_EQ(int64_t(places.size()), m) << "two Gaussians share a cell";
     EXPECT_GT(lattice.min().item<float>(), 0);
     EXPECT_LT(lattice.max().item<float>(), 1);
     // Spread evenly: the centre of all lies within a cell of the voxel's.
-    EXPECT_LE((lattice.mean(0) - .5f).abs().max().item<float>(), 1 / std::ceil(std::cbrt(double(m)) - 1e-9));
+    EXPECT_LE((lattice.mean(0) - .5f).abs().max().item<float>(),
+              1 / std::ceil(std::cbrt(double(m)) - 1e-9));
   }
 }
 
@@ -498,10 +502,13 @@ TEST(EncoderNet, OctantsKeepTheirColours) {  // the way around the transformers
   const auto net = makeNet(c, 10);
   net->gaussian_out->weight.zero_();
   Tensor colours = torch::zeros({1, 8, 3});
-  for (int octant = 0; octant < 8; ++octant) colours[0][octant][0] = .1f * float(octant);  // luminance
-  const GaussianTensors g = net->gaussians({torch::randn({1, c.voxel_width}), colours}, coordTensor({Coord(3, 4, 5)}), 1);
+  for (int octant = 0; octant < 8; ++octant)
+    colours[0][octant][0] = .1f * float(octant);  // luminance
+  const GaussianTensors g =
+      net->gaussians({torch::randn({1, c.voxel_width}), colours}, coordTensor({Coord(3, 4, 5)}), 1);
   for (int64_t i = 0; i < 8; ++i) {
-    const int64_t octant = (g.mean[i][0].item<float>() > 3.5f) * 4 + (g.mean[i][1].item<float>() > 4.5f) * 2 +
+    const int64_t octant = (g.mean[i][0].item<float>() > 3.5f) * 4 +
+                           (g.mean[i][1].item<float>() > 4.5f) * 2 +
                            (g.mean[i][2].item<float>() > 5.5f);
     EXPECT_NEAR(g.sh[i][0][1].item<float>() * kSh0, .05f * float(octant), 1e-5);
   }
@@ -605,7 +612,10 @@ TEST_F(EncoderFile, LoadsExactlyWhatWasSaved) {  // E14
   const Observation o = observed(views, c);
   const LatentGrid latents = encoder.encode(views, o, silent_);
   torch::NoGradGuard no_grad;
-  const Tensor z = net_->normalise(net_->encode(encoderInput(views, o, c)).mean).to(torch::kHalf).to(torch::kFloat32).contiguous();
+  const Tensor z = net_->normalise(net_->encode(encoderInput(views, o, c)).mean)
+                       .to(torch::kHalf)
+                       .to(torch::kFloat32)
+                       .contiguous();
   ASSERT_EQ(int64_t(latents.z.size()), z.numel());
   EXPECT_EQ(std::memcmp(latents.z.data(), z.data_ptr(), z.nbytes()), 0);
   net_->latent_in->bias[0] += 1;
@@ -1015,7 +1025,9 @@ TEST(EncoderTraining, MixedPrecisionIsCloseToFloatAndEndsWithItsScope) {
     const MixedPrecision on(true);
     return run();
   }();
-  const auto off = [](const Tensor& a, const Tensor& b) { return ((a - b).norm() / b.norm()).item<double>(); };
+  const auto off = [](const Tensor& a, const Tensor& b) {
+    return ((a - b).norm() / b.norm()).item<double>();
+  };
   EXPECT_EQ(mixed.first.scalar_type(), torch::kFloat32);
   EXPECT_EQ(mixed.second.scalar_type(), torch::kFloat32);
   EXPECT_GT(off(mixed.first, exact.first), 1e-6) << "not in bfloat16";
@@ -1058,8 +1070,8 @@ TEST_F(EncoderResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // E13
     settings.resume = resume;
     std::vector<TrainLogRow> rows;
     trainEncoder(
-        c, rotatedViews, 5, validation, 1, settings, [&](const TrainLogRow& row) { rows.push_back(row); },
-        progress);
+        c, rotatedViews, 5, validation, 1, settings,
+        [&](const TrainLogRow& row) { rows.push_back(row); }, progress);
     return rows;
   };
   Progress silent;
@@ -1080,7 +1092,8 @@ TEST_F(EncoderResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // E13
   settings.resume = true;
   EncoderConfig other = c;
   other.kl_weight = .5f;
-  EXPECT_THROW(trainEncoder(other, rotatedViews, 5, validation, 0, settings, nullptr, silent), Error);
+  EXPECT_THROW(trainEncoder(other, rotatedViews, 5, validation, 0, settings, nullptr, silent),
+               Error);
 }
 
 /// Trains a toy network on rotations of one room's views and returns the log.
@@ -1089,13 +1102,15 @@ std::vector<TrainLogRow> trainToy(TrainSettings settings, const std::string& fol
   settings.weights_path = folder + "/w.safetensors", settings.work_folder = folder + "/work";
   std::vector<TrainLogRow> rows;
   Progress silent;
-  trainEncoder(toyConfig(), rotatedViews, 5, [](uint64_t) { return roomViews(6); }, 1, settings,
-               [&](const TrainLogRow& row) { rows.push_back(row); }, silent);
+  trainEncoder(
+      toyConfig(), rotatedViews, 5, [](uint64_t) { return roomViews(6); }, 1, settings,
+      [&](const TrainLogRow& row) { rows.push_back(row); }, silent);
   return rows;
 }
 
 TEST_F(EncoderResume, ABatchesGradientIsTheMeanOfItsSamples) {  // E13
-  auto net = std::make_shared<torch::nn::LinearImpl>(3, 1), average = std::make_shared<torch::nn::LinearImpl>(3, 1);
+  auto net = std::make_shared<torch::nn::LinearImpl>(3, 1),
+       average = std::make_shared<torch::nn::LinearImpl>(3, 1);
   TrainSettings settings;
   settings.batch = 2, settings.work_folder = path("mean");
   Trainer trainer(net, average, "toy", "{}", settings, nullptr);
@@ -1108,11 +1123,16 @@ TEST_F(EncoderResume, TwoProcessesTrainAsOneWithTheirBatch) {  // E13, data para
   const std::vector<TrainLogRow> alone = trainToy({}, path("one"));
   TrainSettings shared;
   shared.processes.size = 2, shared.processes.port = uint16_t(20000 + getpid() % 20000);
-  // fork() and threads do not mix: the second process starts over in this program, as the test below.
-  ASSERT_EQ(setenv("VDBC_SECOND_PROCESS", joinText(shared.processes.port, " ", path("two")).c_str(), 1), 0);
+  // fork() and threads do not mix: the second process starts over in this program, as the test
+  // below.
+  ASSERT_EQ(
+      setenv("VDBC_SECOND_PROCESS", joinText(shared.processes.port, " ", path("two")).c_str(), 1),
+      0);
   const std::string program = fs::read_symlink("/proc/self/exe").string();
   FILE* second = popen((program + " --gtest_also_run_disabled_tests "
-                        "--gtest_filter=EncoderResume.DISABLED_SecondProcess 2>&1").c_str(), "r");
+                                  "--gtest_filter=EncoderResume.DISABLED_SecondProcess 2>&1")
+                           .c_str(),
+                       "r");
   ASSERT_NE(second, nullptr);
   const std::vector<TrainLogRow> together = trainToy(shared, path("two"));
   std::string output;
@@ -1122,7 +1142,8 @@ TEST_F(EncoderResume, TwoProcessesTrainAsOneWithTheirBatch) {  // E13, data para
   for (size_t i = 0; i < alone.size(); ++i)
     for (const char* value : {"loss", "image", "kl", "split", "novel_psnr"})
       EXPECT_NEAR(together[i].values.at(value), alone[i].values.at(value),
-                  1e-4 * std::abs(alone[i].values.at(value))) << "step " << i + 1 << ", " << value;
+                  1e-4 * std::abs(alone[i].values.at(value)))
+          << "step " << i + 1 << ", " << value;
 }
 
 TEST_F(EncoderResume, DISABLED_SecondProcess) {

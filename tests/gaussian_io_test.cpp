@@ -414,8 +414,9 @@ TEST_F(GaussianIo, FilesSayWhetherTheyAreAntialiased) {
     g.antialias = antialias;
     writePly(g, path("a.ply"));
     EXPECT_EQ(readPly(path("a.ply")).antialias, antialias);
-    EXPECT_NE(slurp(path("a.ply")).find(antialias ? "\ncomment SplatRenderMode: mip\n"
-                                                  : "\ncomment SplatRenderMode: default\n"),
+    EXPECT_NE(slurp(path("a.ply"))
+                  .find(antialias ? "\ncomment SplatRenderMode: mip\n"
+                                  : "\ncomment SplatRenderMode: default\n"),
               std::string::npos);
     writePointsVdb(g, {}, path("a.vdb"));
     EXPECT_EQ(readPointsVdb(path("a.vdb")).antialias, antialias);

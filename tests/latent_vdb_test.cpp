@@ -144,7 +144,6 @@ TEST(LatentVdb, OnePointAtEachNodesCentre) {
   EXPECT_EQ(grid->metaValue<int64_t>("point_count"), file.latents.size());
 }
 
-
 TEST(LatentVdb, EveryTruncationThrows) {
   const TemporaryFolder folder;
   writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");

@@ -250,13 +250,15 @@ TEST(DiffusionHead, FreshOutputIsExactlyZero) {  // A7
 TEST(DiffusionHead, LossIsTheWeightedErrorOfTheNoise) {  // A7: term by term
   torch::manual_seed(5);
   DiffusionHead head(6, 3, 8, 50);
-  const Tensor h = torch::randn({4, 6}), target = torch::randn({4, 3}), way = torch::tensor({{2.f, 0.f, -1.f}});
+  const Tensor h = torch::randn({4, 6}), target = torch::randn({4, 3}),
+               way = torch::tensor({{2.f, 0.f, -1.f}});
   for (const SnrWeight kind : {SnrWeight::kSnr, SnrWeight::kInverse}) {
     torch::Generator random = at::detail::createCPUGenerator(6);
     const auto l = head.loss(h, target, way, 3, kind, random);
     const Tensor error = head.mean(h) - target;
     const Tensor colour_error = 2 * error.select(1, 0) - error.select(1, 2);
-    EXPECT_NEAR(l.linear.item<double>(), (error.square().mean() + colour_error.square().mean()).item<double>(), 1e-5);
+    EXPECT_NEAR(l.linear.item<double>(),
+                (error.square().mean() + colour_error.square().mean()).item<double>(), 1e-5);
     // A fresh head predicts 0, so the error is the noise itself.
     torch::Generator again = at::detail::createCPUGenerator(6);
     const Tensor t = torch::randint(50, {12}, again, torch::kInt64),
@@ -277,8 +279,8 @@ TEST(DiffusionHead, LinearMeanIsBehindAStopGradient) {  // A7
     head.out->weight.normal_();
   }
   torch::Generator random = at::detail::createCPUGenerator(7);
-  const auto l =
-      head.loss(torch::randn({40, 6}), torch::randn({40, 3}), torch::eye(3), 2, SnrWeight::kInverse, random);
+  const auto l = head.loss(torch::randn({40, 6}), torch::randn({40, 3}), torch::eye(3), 2,
+                           SnrWeight::kInverse, random);
   l.diffusion.backward();
   EXPECT_FALSE(head.linear->weight.grad().defined());
   EXPECT_GT(head.out->weight.grad().abs().sum().item<double>(), 0);
@@ -605,7 +607,8 @@ TEST(Masks, FineMasksPartitionTheCandidates) {  // A2, A3
     ASSERT_EQ(seen, std::set<Coord>(candidates.begin(), candidates.end()));
     for (const Coord& c : m.visible) ASSERT_EQ(s.target_nodes.at(c), NodeState::kFilled);
     for (const Coord& c : m.false_visible) ASSERT_NE(s.target_nodes.at(c), NodeState::kFilled);
-    if (m.visible.empty() && m.false_visible.empty()) {  // nothing but the condition tokens: one level is asked
+    if (m.visible.empty() &&
+        m.false_visible.empty()) {  // nothing but the condition tokens: one level is asked
       const int asked = level.at(m.frontier.at(0));
       for (const Coord& c : m.frontier) EXPECT_EQ(level.at(c), asked);
       asked_alone.insert(asked);
@@ -646,14 +649,15 @@ TEST(Masks, BoundsAreTheSamplesOwnOrAroundOrWithinThem) {
     const CoordBBox b = drawBounds(s, random);
     kept += b == own;
     bool holds = false;
-    for (const Coord& token : s.condition.ijk) holds |= b.isInside(Coord(2 * token.x(), 2 * token.y(), 2 * token.z()));
+    for (const Coord& token : s.condition.ijk)
+      holds |= b.isInside(Coord(2 * token.x(), 2 * token.y(), 2 * token.z()));
     EXPECT_TRUE(holds);
     for (int axis = 0; axis < 3; ++axis) {
       EXPECT_EQ((b.min()[axis] - own.min()[axis]) % 4, 0);
       EXPECT_EQ((b.max()[axis] - own.max()[axis]) % 4, 0);
       EXPECT_LE(b.dim()[axis] * s.condition.frame.voxel_m, 16.01);
       EXPECT_GT(b.dim()[axis], 0);
-      outwards += b.min()[axis] < own.min()[axis], inwards += b.min()[axis] > own.min()[axis];
+      outwards += b.min()[axis]<own.min()[axis], inwards += b.min()[axis]> own.min()[axis];
     }
   }
   EXPECT_NEAR(kept, 300, 60);
@@ -663,7 +667,9 @@ TEST(Masks, BoundsAreTheSamplesOwnOrAroundOrWithinThem) {
 
 TEST(SceneTokens, StatesInABoxAreThoseThereAndUnobservedBeyond) {
   const NodeStates s = toySample().seen_nodes;
-  const auto voxel = [](const Coord& node) { return Coord(2 * node.x(), 2 * node.y(), 2 * node.z()); };
+  const auto voxel = [](const Coord& node) {
+    return Coord(2 * node.x(), 2 * node.y(), 2 * node.z());
+  };
   const CoordBBox box(voxel(s.box.min()) + Coord(4, -8, 0), voxel(s.box.max()) + Coord(9, -3, 1));
   const NodeStates part = statesIn(s, box);
   EXPECT_EQ(part.level, 1);
@@ -855,8 +861,8 @@ TEST_F(CompleterFile, TheFineStageStaysInsideWhatTheCoarseStageKept) {  // A10
     if (entry.second < 1) sorted.push_back(entry.second);
   std::sort(sorted.begin(), sorted.end());
   CompleteSettings settings;
-  // Opens about half of the unknown nodes; lies between two probabilities, whose last bits depend on the
-  // chunks that they were predicted in.
+  // Opens about half of the unknown nodes; lies between two probabilities, whose last bits depend
+  // on the chunks that they were predicted in.
   size_t middle = sorted.size() / 2;
   while (middle + 1 < sorted.size() && sorted[middle + 1] - sorted[middle] < 1e-5f) ++middle;
   ASSERT_LT(middle + 1, sorted.size());
@@ -891,7 +897,8 @@ TEST_F(CompleterFile, RandomOrderHasLevelsOfTheSameSizes) {
   const auto levels = [&] {
     const LatentGrid whole = complete(completer, settings);
     std::map<Coord, int32_t> level;
-    for (size_t i = size_t(sample_.condition.size()); i < whole.ijk.size(); ++i) level[whole.ijk[i]] = whole.bfs_level[i];
+    for (size_t i = size_t(sample_.condition.size()); i < whole.ijk.size(); ++i)
+      level[whole.ijk[i]] = whole.bfs_level[i];
     return level;
   };
   const auto sizes = [](const std::map<Coord, int32_t>& level) {
@@ -932,8 +939,10 @@ TEST_F(CompleterFile, OnlyGrowthThatSeesWhatItMadeGetsNormalisedLatents) {
     CompleteSettings settings;
     settings.generated_context = generated_context;
     const LatentGrid whole = complete(completer, settings);
-    const Tensor z = torch::tensor(whole.z).view({whole.size(), kDim}).slice(0, sample_.condition.size());
-    return z.view({-1, kDim / 4, 4}).mean(2).abs().max().item<double>();  // of a channel group; GroupNorm makes it 0
+    const Tensor z =
+        torch::tensor(whole.z).view({whole.size(), kDim}).slice(0, sample_.condition.size());
+    return z.view({-1, kDim / 4, 4}).mean(2).abs().max().item<double>();  // of a channel group;
+                                                                          // GroupNorm makes it 0
   };
   EXPECT_LT(largestMean(true), 1e-3);
   EXPECT_GT(largestMean(false), .05);
@@ -1019,9 +1028,10 @@ TEST_F(CompleterFile, GoesOnFromAnyLevelAsIfItHadNeverStopped) {
     settings.tau = .5f, settings.hole_tau = .1f, settings.sampling_steps = 3;
     settings.generated_context = generated_context;
     std::vector<std::pair<LatentGrid, int32_t>> stops;
-    const LatentGrid whole = completer.complete(
-        sample_.condition, space, settings, silent_,
-        [&](const LatentGrid& so_far, int32_t next_level) { stops.push_back({so_far, next_level}); });
+    const LatentGrid whole = completer.complete(sample_.condition, space, settings, silent_,
+                                                [&](const LatentGrid& so_far, int32_t next_level) {
+                                                  stops.push_back({so_far, next_level});
+                                                });
     ASSERT_GE(stops.size(), 3u);
     for (const auto& [so_far, next_level] : stops) {
       SCOPED_TRACE(next_level);
@@ -1039,7 +1049,8 @@ TEST_F(CompleterFile, GoesOnFromAnyLevelAsIfItHadNeverStopped) {
 TEST_F(CompleterFile, LatentsAreWhatFilesHold) {
   const Completer completer = completerOf(toyConfig());
   const LatentGrid whole = complete(completer, CompleteSettings());
-  const Tensor z = torch::tensor(std::vector<float>(whole.z.begin() + std::ptrdiff_t(sample_.condition.z.size()), whole.z.end()));
+  const Tensor z = torch::tensor(std::vector<float>(
+      whole.z.begin() + std::ptrdiff_t(sample_.condition.z.size()), whole.z.end()));
   ASSERT_GT(z.numel(), 0);
   EXPECT_TRUE(torch::equal(z, z.to(torch::kHalf).to(torch::kFloat32)));
 }
@@ -1056,7 +1067,8 @@ TEST_F(CompleterFile, NothingIsGeneratedOutsideOfTheRegion) {
   expectObservedRowsFirst(some);
   std::map<Coord, int32_t> expected, found;
   for (int64_t i = sample_.condition.size(); i < everywhere.size(); ++i)
-    if (region->isValueOn(everywhere.ijk[size_t(i)])) expected[everywhere.ijk[size_t(i)]] = everywhere.bfs_level[size_t(i)];
+    if (region->isValueOn(everywhere.ijk[size_t(i)]))
+      expected[everywhere.ijk[size_t(i)]] = everywhere.bfs_level[size_t(i)];
   for (int64_t i = sample_.condition.size(); i < some.size(); ++i)
     found[some.ijk[size_t(i)]] = some.bfs_level[size_t(i)];
   EXPECT_FALSE(found.empty());
@@ -1068,10 +1080,13 @@ TEST_F(CompleterFile, GeneratedTokensOfTheStartStay) {
   CompleteSettings settings;
   settings.tau = .4f;
   const LatentGrid first = complete(completer, settings);
-  const LatentGrid start = keepTokens(first, [&](size_t i) { return first.observed[i] || first.ijk[i].y() < 5; });
+  const LatentGrid start =
+      keepTokens(first, [&](size_t i) { return first.observed[i] || first.ijk[i].y() < 5; });
   ASSERT_GT(start.size(), sample_.condition.size());
-  settings.seed = 2, settings.sampling_steps = 2, settings.tau = .9f;  // also those that it would drop
-  const LatentGrid again = completer.complete(start, spaceOf(sample_.seen_nodes), settings, silent_);
+  settings.seed = 2, settings.sampling_steps = 2,
+  settings.tau = .9f;  // also those that it would drop
+  const LatentGrid again =
+      completer.complete(start, spaceOf(sample_.seen_nodes), settings, silent_);
   ASSERT_GE(again.size(), start.size());
   expectNoDuplicates(again);
   EXPECT_TRUE(std::equal(start.ijk.begin(), start.ijk.end(), again.ijk.begin()));
@@ -1296,7 +1311,8 @@ TEST_F(CompleterFile, HolesAreClosedWithDroppedTokensAlone) {
     EXPECT_LE(closed.probability[i], .5f);
     EXPECT_EQ(closed.probability[i], everything.probability[same]);
     EXPECT_EQ(closed.bfs_level[i], everything.bfs_level[same]);
-    EXPECT_TRUE(std::equal(&closed.z[i * kDim], &closed.z[i * kDim] + kDim, &everything.z[same * kDim]));
+    EXPECT_TRUE(
+        std::equal(&closed.z[i * kDim], &closed.z[i * kDim] + kDim, &everything.z[same * kDim]));
   }
 }
 
@@ -1423,8 +1439,8 @@ TEST_F(CompleterResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // A14
     settings.resume = resume;
     std::vector<TrainLogRow> rows;
     trainCompleter(
-        c, kOneColour, samples, 4, samples, 2, settings, [&](const TrainLogRow& row) { rows.push_back(row); },
-        progress);
+        c, kOneColour, samples, 4, samples, 2, settings,
+        [&](const TrainLogRow& row) { rows.push_back(row); }, progress);
     return rows;
   };
   Progress silent;
@@ -1438,7 +1454,8 @@ TEST_F(CompleterResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // A14
   EXPECT_TRUE(bytesOf(path("parts.safetensors")) != bytesOf(path("whole.safetensors")));
   train("parts", true, silent);
   EXPECT_TRUE(bytesOf(path("parts.safetensors")) == bytesOf(path("whole.safetensors")));
-  EXPECT_TRUE(bytesOf(path("parts/checkpoint.safetensors")) == bytesOf(path("whole/checkpoint.safetensors")));
+  EXPECT_TRUE(bytesOf(path("parts/checkpoint.safetensors")) ==
+              bytesOf(path("whole/checkpoint.safetensors")));
   EXPECT_TRUE(bytesOf(path("parts/log.csv")) == bytesOf(path("whole/log.csv")));
   const Completer completer(path("whole.safetensors"));
   EXPECT_EQ(completer.trainedOn(), "toys");
@@ -1456,7 +1473,8 @@ TEST_F(CompleterResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // A14
             1e-4);
   settings.resume = true;
   settings.work_folder = path("none");
-  EXPECT_THROW(trainCompleter(c, kOneColour, samples, 4, samples, 0, settings, nullptr, silent), Error);
+  EXPECT_THROW(trainCompleter(c, kOneColour, samples, 4, samples, 0, settings, nullptr, silent),
+               Error);
 }
 
 TEST_F(CompleterResume, ATrainingCanStartFromGivenWeights) {
@@ -1471,10 +1489,12 @@ TEST_F(CompleterResume, ATrainingCanStartFromGivenWeights) {
     return readTensors(settings.weights_path).tensors;
   };
   const auto first = train("first");
-  // Other samples' latents, another seed and other settings: with a rate of 0 nothing of them shows.
+  // Other samples' latents, another seed and other settings: with a rate of 0 nothing of them
+  // shows.
   settings.from = path("first.safetensors"), settings.learning_rate = 0, settings.seed = 2;
   c.rotary_positions = false;
-  for (const auto& [name, tensor] : train("second")) EXPECT_TRUE(torch::equal(tensor, first.at(name))) << name;
+  for (const auto& [name, tensor] : train("second"))
+    EXPECT_TRUE(torch::equal(tensor, first.at(name))) << name;
   c.width = 16;
   EXPECT_THROW(train("third"), Error);
 }

@@ -181,7 +181,8 @@ TEST(PictureErrorOf, RefusesWhatDoesNotFit) {
   for (double v : {none.psnr, none.ssim, none.flip}) EXPECT_TRUE(std::isnan(v));
   EXPECT_THROW(pictureError(a, a, std::vector<uint8_t>(96 * 63, 1)), Error);
   EXPECT_THROW(pictureError(a, pattern(0, 64, 96), std::vector<uint8_t>(96 * 64, 1)), Error);
-  EXPECT_THROW(pictureError(Image(16, 16, 1), Image(16, 16, 1), std::vector<uint8_t>(256, 1)), Error);
+  EXPECT_THROW(pictureError(Image(16, 16, 1), Image(16, 16, 1), std::vector<uint8_t>(256, 1)),
+               Error);
 }
 
 TEST(DepthErrorOf, ComparesWhereBothAreMeasured) {

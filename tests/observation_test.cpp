@@ -257,7 +257,8 @@ TEST(ObservedPixels, AreThoseWhosePointsLieInAnObservedToken) {
     for (const Pixel& p : usablePixels(views, frame)) tokens.insert(tokenCoord(p.voxel, level));
     std::vector<uint8_t> expected(size, 0);
     for (const Pixel& p : usablePixels({other}, frame))
-      expected[size_t(p.y * other.camera.width + p.x)] = uint8_t(tokens.count(tokenCoord(p.voxel, level)));
+      expected[size_t(p.y * other.camera.width + p.x)] =
+          uint8_t(tokens.count(tokenCoord(p.voxel, level)));
     const auto count = std::count(expected.begin(), expected.end(), 1);
     EXPECT_GT(count, 0);
     EXPECT_LT(size_t(count), size);

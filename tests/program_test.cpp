@@ -92,8 +92,10 @@ class Program : public ::testing::Test {
 
   std::string at(const std::string& name) const { return root_ + "/" + name; }
 
-  // Starts the program; with `signal_at`, sends SIGINT once that stage has begun (needs --json) and that file is there.
-  Ended run(const Args& args, const std::string& signal_at = "", const std::string& file = "") const {
+  // Starts the program; with `signal_at`, sends SIGINT once that stage has begun (needs --json) and
+  // that file is there.
+  Ended run(const Args& args, const std::string& signal_at = "",
+            const std::string& file = "") const {
     const std::string out = at("stdout.txt"), err = at("stderr.txt");
     posix_spawn_file_actions_t actions;
     posix_spawn_file_actions_init(&actions);
@@ -242,7 +244,8 @@ TEST_F(Program, ValuesThatCannotBeExitWith2) {
   for (const char* frames : {"3-", "2-1", "0,,1", "0;1"})
     expectFailure(complete(views, {std::string("--frames=") + frames}), kUsage, frames);
   for (const char* change : {"width", "none=1", "width=wide", "width=7"})
-    expectFailure({"train", "encoder", "-o", at("w.safetensors"), "--set", change}, kUsage, "--set");
+    expectFailure({"train", "encoder", "-o", at("w.safetensors"), "--set", change}, kUsage,
+                  "--set");
 }
 
 TEST_F(Program, FramesOutOfRangeNameTheViews) {
@@ -255,7 +258,8 @@ TEST_F(Program, FramesOutOfRangeNameTheViews) {
 
 TEST_F(Program, HelpOfEveryVerbListsTheCommonOptions) {
   const std::vector<Args> verbs = {
-      {}, {"info"}, {"encode"}, {"decode"}, {"render"}, {"check"}, {"eval"}, {"train", "encoder"}, {"train", "mar"}};
+      {},        {"info"}, {"encode"},           {"decode"},      {"render"},
+      {"check"}, {"eval"}, {"train", "encoder"}, {"train", "mar"}};
   for (Args args : verbs) {
     args.push_back("--help");
     SCOPED_TRACE(testing::PrintToString(args));
@@ -621,8 +625,9 @@ TEST_F(Program, DecodeRefusesOtherWeightsAndFiles) {
   expectFailure({"encode", views, "-o", output_ + "/x.vdb", "--weights", VDBC_WEIGHTS}, kUsage,
                 ".latent.vdb");
   expectFailure({"encode", views}, kUsage, "--output");
-  expectFailure({"encode", at("missing"), "-o", output_ + "/x.latent.vdb", "--weights", VDBC_WEIGHTS},
-                kFailed, at("missing"));
+  expectFailure(
+      {"encode", at("missing"), "-o", output_ + "/x.latent.vdb", "--weights", VDBC_WEIGHTS},
+      kFailed, at("missing"));
   expectFailure(complete(views, {"--scale", "2"}), kFailed, "metres already");
   expectFailure(complete(views, {"--scale", "0"}), kUsage, "--scale");
 }
@@ -633,7 +638,8 @@ TEST_F(Program, LatentsOfACompletionAreCompletedAgain) {
   ASSERT_EQ(first.code, kOk) << first.err;
   const std::string latents = output_ + "/x.latent.vdb";
   const LatentFile before = readLatentVdb(latents);
-  const int32_t last = *std::max_element(before.latents.bfs_level.begin(), before.latents.bfs_level.end());
+  const int32_t last =
+      *std::max_element(before.latents.bfs_level.begin(), before.latents.bfs_level.end());
   ASSERT_GE(last, 3);
   auto again = [&](const Args& more) {
     Args args = {latents, "-o", at("y/y.vdb"), "--weights", VDBC_WEIGHTS, "--json"};
@@ -648,8 +654,10 @@ TEST_F(Program, LatentsOfACompletionAreCompletedAgain) {
   for (const char* ending : {".ply", ".points.vdb", ".latent.vdb"})
     EXPECT_TRUE(readText(at("y/y") + ending) == readText(output_ + "/x" + ending)) << ending;
   // Levels below the given one stay, whatever tau is, the others are made anew.
-  const LatentGrid other = again({"--from-level", "2", "--sampling-steps", "2", "--seed", "9", "--tau", ".6"});
-  const LatentGrid kept = keepTokens(before.latents, [&](size_t i) { return before.latents.bfs_level[i] < 2; });
+  const LatentGrid other =
+      again({"--from-level", "2", "--sampling-steps", "2", "--seed", "9", "--tau", ".6"});
+  const LatentGrid kept =
+      keepTokens(before.latents, [&](size_t i) { return before.latents.bfs_level[i] < 2; });
   ASSERT_GT(other.size(), kept.size());
   EXPECT_TRUE(std::equal(kept.ijk.begin(), kept.ijk.end(), other.ijk.begin()));
   EXPECT_TRUE(std::equal(kept.z.begin(), kept.z.end(), other.z.begin()));
@@ -673,21 +681,25 @@ TEST_F(Program, LatentsOfACompletionAreCompletedAgain) {
   };
   ASSERT_EQ(generatedSides(before.latents).size(), 2u);
   EXPECT_EQ(generatedSides(again({"--region", at("half.vdb")})), std::set<bool>{false});
-  const LatentGrid locked = again({"--lock", at("half.vdb"), "--sampling-steps", "2", "--seed", "9"});
+  const LatentGrid locked =
+      again({"--lock", at("half.vdb"), "--sampling-steps", "2", "--seed", "9"});
   std::map<Coord, size_t> row;
   for (size_t i = 0; i < locked.ijk.size(); ++i) row[locked.ijk[i]] = i;
   for (size_t i = 0; i < before.latents.ijk.size(); ++i) {
     if (before.latents.ijk[i].x() * 2 >= middle) continue;
     const size_t same = row.at(before.latents.ijk[i]), dim = size_t(locked.dim);
-    EXPECT_TRUE(std::equal(&locked.z[same * dim], &locked.z[same * dim] + dim, &before.latents.z[i * dim]));
+    EXPECT_TRUE(
+        std::equal(&locked.z[same * dim], &locked.z[same * dim] + dim, &before.latents.z[i * dim]));
   }
-  for (const Args& more : {Args{"--frames", "0"}, Args{"--margin", "1"}, Args{"--scale", "2"}, Args{"--up", "0", "0", "1"}}) {
+  for (const Args& more : {Args{"--frames", "0"}, Args{"--margin", "1"}, Args{"--scale", "2"},
+                           Args{"--up", "0", "0", "1"}}) {
     Args args = {latents, "-o", at("y/z.vdb"), "--weights", VDBC_WEIGHTS};
     args.insert(args.end(), more.begin(), more.end());
     expectFailure(args, kUsage, more[0]);
   }
   expectFailure({latents, "-o", output_ + "/x.vdb", "--weights", VDBC_WEIGHTS}, kUsage, latents);
-  expectFailure({latents, "-o", at("y/z.vdb"), "--weights", VDBC_WEIGHTS, "--from-level", "900"}, kFailed, "--from-level");
+  expectFailure({latents, "-o", at("y/z.vdb"), "--weights", VDBC_WEIGHTS, "--from-level", "900"},
+                kFailed, "--from-level");
   expectFailure(complete(at("views"), {"--from-level", "2"}), kUsage, "--from-level");
   expectFailure(complete(at("views"), {"--region", at("missing.vdb")}), kFailed, at("missing.vdb"));
 }
@@ -696,7 +708,8 @@ TEST_F(Program, SeveralSamplesComeWithTheirMeanAndVariance) {
   NEEDS_WEIGHTS();
   const std::string views = writeRoom("views");
   Args options = smallBox();
-  options.insert(options.end(), {"--samples", "2", "--sampling-steps", "2", "--generated-context", "--json"});
+  options.insert(options.end(),
+                 {"--samples", "2", "--sampling-steps", "2", "--generated-context", "--json"});
   const Ended ended = run(complete(views, options));
   ASSERT_EQ(ended.code, kOk) << ended.err;
   Args expected = {"x.occupancy.vdb"};
@@ -710,7 +723,8 @@ TEST_F(Program, SeveralSamplesComeWithTheirMeanAndVariance) {
   options.insert(options.end(), {"--seed", "2", "-o", at("z/z.vdb")});
   Args second = {views, "--weights", VDBC_WEIGHTS};
   for (const std::string& o : options) second.push_back(o);
-  second.erase(std::find(second.begin(), second.end(), "--samples"), std::find(second.begin(), second.end(), "--samples") + 2);
+  second.erase(std::find(second.begin(), second.end(), "--samples"),
+               std::find(second.begin(), second.end(), "--samples") + 2);
   ASSERT_EQ(run(second).code, kOk);
   EXPECT_TRUE(readText(at("z/z.ply")) == readText(output_ + "/x.2.ply"));
   expectFailure(complete(views, {"--samples", "2"}), kUsage, "--sampling-steps");
@@ -727,16 +741,19 @@ TEST_F(Program, RethresholdDropsWhatIsLessProbable) {
   for (size_t i = 0; i < before.ijk.size(); ++i)
     if (!before.observed[i]) chances.push_back(before.probability[i]);
   ASSERT_FALSE(chances.empty());
-  std::nth_element(chances.begin(), chances.begin() + std::ptrdiff_t(chances.size() / 2), chances.end());
+  std::nth_element(chances.begin(), chances.begin() + std::ptrdiff_t(chances.size() / 2),
+                   chances.end());
   const float tau = chances[chances.size() / 2];
-  const Ended ended = run({"rethreshold", x, "--tau", std::to_string(tau), "-o", at("y/y.vdb"), "--json"});
+  const Ended ended =
+      run({"rethreshold", x, "--tau", std::to_string(tau), "-o", at("y/y.vdb"), "--json"});
   ASSERT_EQ(ended.code, kOk) << ended.err;
   EXPECT_EQ(listing(at("y")), (Args{"y.ply", "y.points.vdb", "y.vdb"}));
   const SceneVoxels after = readSceneVdb(at("y/y.vdb"));
   std::map<Coord, float> expected, found;
   const float limit = std::stof(std::to_string(tau));
   for (size_t i = 0; i < before.ijk.size(); ++i)
-    if (before.observed[i] || before.probability[i] > limit) expected[before.ijk[i]] = before.density[i];
+    if (before.observed[i] || before.probability[i] > limit)
+      expected[before.ijk[i]] = before.density[i];
   for (size_t i = 0; i < after.ijk.size(); ++i) found[after.ijk[i]] = after.density[i];
   EXPECT_EQ(found, expected);
   EXPECT_LT(found.size(), before.ijk.size());
@@ -758,8 +775,10 @@ TEST_F(Program, RethresholdDropsWhatIsLessProbable) {
   };
   EXPECT_EQ(tokensOf(readSceneVdb(x)), tokensOf(after));
   expectFailure({"rethreshold", x, "--tau", "0", "-o", output_ + "/z.vdb"}, kFailed, x);
-  expectFailure({"rethreshold", writeVolume(), "--tau", ".5", "-o", output_ + "/z.vdb"}, kFailed, "points.vdb");
-  expectFailure({"rethreshold", output_ + "/x.latent.vdb", "--tau", ".5", "-o", output_ + "/z.vdb"}, kUsage, "x.latent.vdb");
+  expectFailure({"rethreshold", writeVolume(), "--tau", ".5", "-o", output_ + "/z.vdb"}, kFailed,
+                "points.vdb");
+  expectFailure({"rethreshold", output_ + "/x.latent.vdb", "--tau", ".5", "-o", output_ + "/z.vdb"},
+                kUsage, "x.latent.vdb");
   expectFailure({"rethreshold", x, "--tau", ".5", "-o", x}, kUsage, x);
   expectFailure({"rethreshold", x, "--tau", "2", "-o", output_ + "/z.vdb"}, kUsage, "--tau");
 }
@@ -781,7 +800,8 @@ TEST_F(Program, AnInterruptedCompletionIsResumedToTheSameBytes) {
   ASSERT_EQ(cut.code, kInterrupted) << "it was faster than the signal";
   EXPECT_EQ(listing(output_), Args{"x.checkpoint.latent.vdb"});
   EXPECT_LT(readLatentVdb(checkpoint).latents.size(), latents.size());
-  expectFailure({"decode", checkpoint, "-o", at("y/y.vdb"), "--weights", VDBC_WEIGHTS}, kFailed, "cut short");
+  expectFailure({"decode", checkpoint, "-o", at("y/y.vdb"), "--weights", VDBC_WEIGHTS}, kFailed,
+                "cut short");
   options.push_back("--resume");
   Args other = options;
   other.insert(other.end(), {"--tau", ".3"});
@@ -790,7 +810,8 @@ TEST_F(Program, AnInterruptedCompletionIsResumedToTheSameBytes) {
   const Ended resumed = run(complete(views, options));
   ASSERT_EQ(resumed.code, kOk) << resumed.err;
   EXPECT_EQ(listing(output_), kSiblings);
-  for (const std::string& name : kSiblings) EXPECT_TRUE(readText(output_ + "/" + name) == bytes[name]) << name;
+  for (const std::string& name : kSiblings)
+    EXPECT_TRUE(readText(output_ + "/" + name) == bytes[name]) << name;
 }
 
 TEST_F(Program, TheSeedFixesEveryByteOfThePly) {
@@ -853,49 +874,61 @@ TEST_F(Program, RenderShowsTheSplatsFromTheCameras) {
 
 TEST_F(Program, RenderGoesRoundAndAlong) {
   const std::string splats = writeSplats(), views = writeRoom("views", 3);
-  const Ended turn = run({"render", splats, "--turntable", "12", "--size", "40", "30", "--fov", "50", "--frames",
-                          "0,10-11", "-o", output_ + "/turn.###.exr", "--preview", "--json"});
+  const Ended turn =
+      run({"render", splats, "--turntable", "12", "--size", "40", "30", "--fov", "50", "--frames",
+           "0,10-11", "-o", output_ + "/turn.###.exr", "--preview", "--json"});
   EXPECT_EQ(turn.code, kOk) << turn.err;
-  EXPECT_EQ(listing(output_), (Args{"turn.000.exr", "turn.000.png", "turn.010.exr", "turn.010.png", "turn.011.exr",
-                                    "turn.011.png"}));
+  EXPECT_EQ(listing(output_), (Args{"turn.000.exr", "turn.000.png", "turn.010.exr", "turn.010.png",
+                                    "turn.011.exr", "turn.011.png"}));
   ASSERT_EQ(lines(turn.out).size(), 3u);
   const json said = json::parse(lines(turn.out)[1]);
   EXPECT_EQ(said.at("frame"), 10);
   EXPECT_EQ(said.at("image"), output_ + "/turn.010.exr");
   EXPECT_EQ(said.at("preview"), output_ + "/turn.010.png");
-  EXPECT_NE(turn.err.find("{\"stage\": \"render\", \"percent\": 66"), std::string::npos) << turn.err;
+  EXPECT_NE(turn.err.find("{\"stage\": \"render\", \"percent\": 66"), std::string::npos)
+      << turn.err;
   EXPECT_EQ(readImage(output_ + "/turn.010.png").width, 40);
 
-  const Ended flight = run({"render", splats, "--cameras", views, "--flythrough", "5", "-o", output_ + "/flight"});
+  const Ended flight =
+      run({"render", splats, "--cameras", views, "--flythrough", "5", "-o", output_ + "/flight"});
   EXPECT_EQ(flight.code, kOk) << flight.err;
-  EXPECT_EQ(listing(output_ + "/flight"), (Args{"0000.png", "0001.png", "0002.png", "0003.png", "0004.png"}));
+  EXPECT_EQ(listing(output_ + "/flight"),
+            (Args{"0000.png", "0001.png", "0002.png", "0003.png", "0004.png"}));
   const Gaussians g = readPly(splats);
   const std::vector<View> through = readViews(views);
   for (size_t i = 0; i < 3; ++i)  // every other frame is a view's
     EXPECT_GT(psnr(readImage(output_ + "/flight/000" + std::to_string(2 * i) + ".png"),
-                   rasterize(g, through[i].camera, {}).colour), 45);
+                   rasterize(g, through[i].camera, {}).colour),
+              45);
 }
 
 TEST_F(Program, RenderRefusesContradictions) {
   const std::string splats = writeSplats(), views = writeRoom("views"), x = output_ + "/####.png";
-  expectFailure({"render", splats, "--turntable", "4", "--cameras", views, "-o", x}, kUsage, "--cameras");
-  expectFailure({"render", splats, "--turntable", "4", "--flythrough", "4", "-o", x}, kUsage, "--flythrough");
+  expectFailure({"render", splats, "--turntable", "4", "--cameras", views, "-o", x}, kUsage,
+                "--cameras");
+  expectFailure({"render", splats, "--turntable", "4", "--flythrough", "4", "-o", x}, kUsage,
+                "--flythrough");
   expectFailure({"render", splats, "--flythrough", "4", "-o", x}, kUsage, "--cameras");
-  expectFailure({"render", splats, "--flythrough", "4", "--cameras", views + "/transforms.json", "--frames", "4", "-o",
-                 x}, kUsage, "--frames");
+  expectFailure({"render", splats, "--flythrough", "4", "--cameras", views + "/transforms.json",
+                 "--frames", "4", "-o", x},
+                kUsage, "--frames");
   expectFailure({"render", splats, "--turntable", "0", "-o", x}, kUsage, "--turntable");
   expectFailure({"render", splats, "--turntable", "4", "-o", output_ + "/one.png"}, kUsage, "####");
   expectFailure({"render", splats, "--turntable", "4", "--preview", "-o", x}, kUsage, "--preview");
-  expectFailure({"render", splats, "--turntable", "4", "--size", "0", "9", "-o", x}, kUsage, "--size");
+  expectFailure({"render", splats, "--turntable", "4", "--size", "0", "9", "-o", x}, kUsage,
+                "--size");
   expectFailure({"render", splats, "--turntable", "4", "--fov", "180", "-o", x}, kUsage, "--fov");
-  expectFailure({"render", splats, "--turntable", "4", "--up", "0", "0", "0", "-o", x}, kUsage, "--up");
-  expectFailure({"render", splats, "--turntable", "4", "-o", at("splats.ply") + "/x.####.png"}, kFailed, "splats.ply");
+  expectFailure({"render", splats, "--turntable", "4", "--up", "0", "0", "0", "-o", x}, kUsage,
+                "--up");
+  expectFailure({"render", splats, "--turntable", "4", "-o", at("splats.ply") + "/x.####.png"},
+                kFailed, "splats.ply");
 }
 
 TEST_F(Program, AnInterruptOfRenderLeavesWholeFrames) {
   const std::string splats = writeSplats();
   const Ended ended = run({"render", splats, "--turntable", "100000", "--size", "64", "64", "-o",
-                           output_ + "/######.exr", "--json"}, "render");
+                           output_ + "/######.exr", "--json"},
+                          "render");
   EXPECT_EQ(ended.code, kInterrupted);
   EXPECT_EQ(lines(ended.err).back(), "vdb_complete: interrupted");
   const Args files = listing(output_);
@@ -943,8 +976,9 @@ TEST_F(Program, CheckFindsCarvedVoxelsInAgreement) {
 TEST_F(Program, EvalPrintsEveryMethodOnce) {
   NEEDS_WEIGHTS();
   const std::string folder = writeRoom("views", 3);
-  const Ended ended = run({"eval", "--scenes", folder, "--views", "2", "--weights", VDBC_WEIGHTS,
-                           "--coarse-tau", "1", "--taus", ".2", "0.75", "--pictures", at("pictures"), "--json"});
+  const Ended ended =
+      run({"eval", "--scenes", folder, "--views", "2", "--weights", VDBC_WEIGHTS, "--coarse-tau",
+           "1", "--taus", ".2", "0.75", "--pictures", at("pictures"), "--json"});
   ASSERT_EQ(ended.code, kOk) << ended.err;
   std::map<std::string, int> scene, mean;
   for (const std::string& line : lines(ended.out)) {
@@ -954,7 +988,8 @@ TEST_F(Program, EvalPrintsEveryMethodOnce) {
     EXPECT_GT(result.at("flip").get<double>(), 0);
     EXPECT_LT(result.at("flip").get<double>(), 1);
     EXPECT_TRUE(result.at("lpips").is_null());  // no network was given
-    for (const char* of_truth : {"f1", "iou", "shell_recall", "furniture_recall", "outside", "ece", "leak"})
+    for (const char* of_truth :
+         {"f1", "iou", "shell_recall", "furniture_recall", "outside", "ece", "leak"})
       EXPECT_TRUE(result.at(of_truth).is_null()) << of_truth;
     if (result.at("method") != "box") {
       EXPECT_GT(result.at("depth_rmse_m").get<double>(), result.at("depth_median_m").get<double>());
@@ -962,7 +997,8 @@ TEST_F(Program, EvalPrintsEveryMethodOnce) {
     }
   }
   const std::map<std::string, int> once = {
-      {"box", 1}, {"completed", 1}, {"completed-tau-0.2", 1}, {"completed-tau-0.75", 1}, {"nearest", 1}, {"observed", 1}, {"pixel-aligned", 1}};
+      {"box", 1},     {"completed", 1}, {"completed-tau-0.2", 1}, {"completed-tau-0.75", 1},
+      {"nearest", 1}, {"observed", 1},  {"pixel-aligned", 1}};
   EXPECT_EQ(scene, once);
   EXPECT_EQ(mean, once);
   const Image sheet = readImage(at("pictures/0.png"));
@@ -978,13 +1014,14 @@ TEST_F(Program, EvalReconstructNeedsOnlyTheEncoder) {
   const std::string folder = writeRoom("views", 3), weights = at("weights");
   fs::create_directory(weights);
   fs::copy(VDBC_WEIGHTS "/encoder.safetensors", weights);
-  const Ended ended = run({"eval", "--reconstruct", "--scenes", folder, "--views", "2", "--weights", weights,
-                           "--optimise", "0.2", "--pictures", at("pictures"), "--json"});
+  const Ended ended = run({"eval", "--reconstruct", "--scenes", folder, "--views", "2", "--weights",
+                           weights, "--optimise", "0.2", "--pictures", at("pictures"), "--json"});
   ASSERT_EQ(ended.code, kOk) << ended.err;
   Args methods;
   for (const std::string& line : lines(ended.out)) {
     const json result = json::parse(line);
-    methods.push_back(result.at("scene").get<std::string>() == "mean" ? "mean" : result.at("method"));
+    methods.push_back(result.at("scene").get<std::string>() == "mean" ? "mean"
+                                                                      : result.at("method"));
     EXPECT_EQ(result.at("views"), 2);
     EXPECT_TRUE(result.at("leak").is_null());  // no truth
     for (const char* kind : {"input", "other"}) {
@@ -993,8 +1030,8 @@ TEST_F(Program, EvalReconstructNeedsOnlyTheEncoder) {
     }
     EXPECT_EQ(result.at("decode_seconds").is_null(), result.at("method") != "reconstructed");
   }
-  EXPECT_EQ(methods, (Args{"reconstructed", "voxel-mean", "pixel-aligned", "optimised", "mean", "mean", "mean",
-                           "mean"}));
+  EXPECT_EQ(methods, (Args{"reconstructed", "voxel-mean", "pixel-aligned", "optimised", "mean",
+                           "mean", "mean", "mean"}));
   const Image sheet = readImage(at("pictures/0.png"));
   EXPECT_EQ(sheet.width % 5, 0);   // the truth and four methods
   EXPECT_EQ(sheet.height % 3, 0);  // two input views and the one other
@@ -1002,17 +1039,24 @@ TEST_F(Program, EvalReconstructNeedsOnlyTheEncoder) {
 
 TEST_F(Program, TrainingRefusesAStartThatIsNoCompleterBeforeAnyWork) {
   NEEDS_WEIGHTS();
-  for (const std::string& from : {at("missing.safetensors"), std::string(VDBC_WEIGHTS "/encoder.safetensors")}) {
-    expectFailure({"train", "mar", "--encoder", VDBC_WEIGHTS "/encoder.safetensors", "--from", from, "-o",
-                   at("new.safetensors")}, kFailed, from);
+  for (const std::string& from :
+       {at("missing.safetensors"), std::string(VDBC_WEIGHTS "/encoder.safetensors")}) {
+    expectFailure({"train", "mar", "--encoder", VDBC_WEIGHTS "/encoder.safetensors", "--from", from,
+                   "-o", at("new.safetensors")},
+                  kFailed, from);
     EXPECT_FALSE(fs::exists(at("new.safetensors.work")));
   }
 }
 
 TEST_F(Program, EvalReconstructRefusesOptionsOfTheCompletion) {
   const Args reconstruct = {"eval", "--scenes", "rooms:1", "--reconstruct"};
-  for (const Args& more : std::vector<Args>{{"--tau", ".1"}, {"--taus", ".1"}, {"--random-order"}, {"--lpips", "x.pt"}, {"--refine-observed"},
-                                            {"--optimise", "-1"}, {"--optimise", "nan"}}) {
+  for (const Args& more : std::vector<Args>{{"--tau", ".1"},
+                                            {"--taus", ".1"},
+                                            {"--random-order"},
+                                            {"--lpips", "x.pt"},
+                                            {"--refine-observed"},
+                                            {"--optimise", "-1"},
+                                            {"--optimise", "nan"}}) {
     Args args = reconstruct;
     args.insert(args.end(), more.begin(), more.end());
     expectFailure(args, kUsage, more[0]);

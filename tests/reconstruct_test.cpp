@@ -26,9 +26,11 @@ Place placeOf(std::vector<View> views) {
   std::vector<DepthView> depth;
   for (const View& v : views) depth.push_back(v.depthView());
   Progress silent;
-  Observation o = observe(views, fitVolume(depth, VolumeSettings(), CarveSettings()), ObservationSettings(), silent);
+  Observation o = observe(views, fitVolume(depth, VolumeSettings(), CarveSettings()),
+                          ObservationSettings(), silent);
   Place place{std::move(views), std::move(o), {}};
-  for (const View& v : place.views) place.observed.push_back(observedPixels(v, place.observation, 1, CarveSettings()));
+  for (const View& v : place.views)
+    place.observed.push_back(observedPixels(v, place.observation, 1, CarveSettings()));
   return place;
 }
 
@@ -40,7 +42,9 @@ const Place& simplePlace() {
 double meanPsnr(const Gaussians& g, const Place& place) {
   double sum = 0;
   for (size_t i = 0; i < place.views.size(); ++i)
-    sum += pictureError(place.views[i].colour, rasterize(g, place.views[i].camera, {}).colour, place.observed[i]).psnr;
+    sum += pictureError(place.views[i].colour, rasterize(g, place.views[i].camera, {}).colour,
+                        place.observed[i])
+               .psnr;
   return sum / double(place.views.size());
 }
 
@@ -97,7 +101,9 @@ TEST(Reconstruct, AnInterruptedOptimisationStops) {
     bool wasInterrupted(int) override { return true; }
   } impatient;
   const Place& place = simplePlace();
-  EXPECT_THROW(optimised(voxelMean(place.observation, 1), place.views, place.observed, {}, impatient), Cancelled);
+  EXPECT_THROW(
+      optimised(voxelMean(place.observation, 1), place.views, place.observed, {}, impatient),
+      Cancelled);
 }
 
 TEST(Reconstruct, SplitScoresKnowTheTruth) {
@@ -122,14 +128,16 @@ TEST(Reconstruct, SplitScoresKnowTheTruth) {
     EXPECT_EQ(all.recall, 1);
     EXPECT_GT(all.precision, 0);
     EXPECT_LT(all.precision, 1);
-    const SetScores seen = splitScores(truth, o, o.tokens.coords(0), level);  // adds nothing to what was seen
+    const SetScores seen =
+        splitScores(truth, o, o.tokens.coords(0), level);  // adds nothing to what was seen
     EXPECT_TRUE(std::isnan(seen.precision));
     EXPECT_EQ(seen.recall, 0);
   }
 }
 
 TEST(Reconstruct, SetScoresCount) {
-  const SetScores s = setScores({{0, 0, 0}, {0, 0, 1}, {0, 0, 2}}, {{0, 0, 1}, {0, 0, 2}, {0, 0, 3}, {0, 0, 4}});
+  const SetScores s =
+      setScores({{0, 0, 0}, {0, 0, 1}, {0, 0, 2}}, {{0, 0, 1}, {0, 0, 2}, {0, 0, 3}, {0, 0, 4}});
   EXPECT_DOUBLE_EQ(s.precision, 2 / 3.);
   EXPECT_DOUBLE_EQ(s.recall, .5);
   EXPECT_DOUBLE_EQ(s.f1, 4 / 7.);
@@ -139,9 +147,11 @@ TEST(Reconstruct, SetScoresCount) {
 }
 
 TEST(Evaluate, OutsideIsWhatLiesBehindTheShell) {
-  // A room of 2 x 1.6 x 1.2 m, turned; its walls in the middle of nodes: 11 x 9 x 7 nodes are in it or in its shell.
+  // A room of 2 x 1.6 x 1.2 m, turned; its walls in the middle of nodes: 11 x 9 x 7 nodes are in it
+  // or in its shell.
   Room room;
-  room.world_from_room = Eigen::Translation3f(1, -2, .3f) * Eigen::AngleAxisf(.7f, Eigen::Vector3f::UnitZ());
+  room.world_from_room =
+      Eigen::Translation3f(1, -2, .3f) * Eigen::AngleAxisf(.7f, Eigen::Vector3f::UnitZ());
   SurfaceMesh local;
   const Eigen::Vector3f size(2, 1.6f, 1.2f);
   addBox(Eigen::Vector3f::Zero(), size, Material(), true, &local);
@@ -149,10 +159,13 @@ TEST(Evaluate, OutsideIsWhatLiesBehindTheShell) {
   room.floor = {{0, 0}, {size.x(), 0}, {size.x(), size.y()}, {0, size.y()}};
   room.ceilings = {{0, 0, size.z()}};
   EvaluationScene scene;
-  scene.is_within = [&](const Eigen::Vector3f& p) { return isWithin(room, room.world_from_room.inverse() * p); };
+  scene.is_within = [&](const Eigen::Vector3f& p) {
+    return isWithin(room, room.world_from_room.inverse() * p);
+  };
   VoxelFrame frame;
   frame.world_from_grid = room.world_from_room.cast<double>();
-  frame.world_from_grid.linear() = Eigen::Quaterniond(frame.world_from_grid.linear()).normalized().toRotationMatrix();
+  frame.world_from_grid.linear() =
+      Eigen::Quaterniond(frame.world_from_grid.linear()).normalized().toRotationMatrix();
   frame.world_from_grid.translate(Eigen::Vector3d::Constant(-.1));
   const std::vector<Coord> surface = surfaceNodes(solidMesh(room.surface), frame, 1);
   const std::set<Coord> truth(surface.begin(), surface.end());
@@ -171,15 +184,18 @@ TEST(Evaluate, ReliabilityCountsGeneratedNodes) {
     latents.ijk.emplace_back(x, 0, 0);
     latents.probability.push_back(probability), latents.observed.push_back(observed);
   };
-  add(0, 1, true), add(1, .25f, false), add(2, .25f, false), add(3, .75f, false), add(4, 1, false), add(5, 0, false);
+  add(0, 1, true), add(1, .25f, false), add(2, .25f, false), add(3, .75f, false), add(4, 1, false),
+      add(5, 0, false);
   const Reliability r = reliabilityOf(latents, {{0, 0, 0}, {1, 0, 0}, {4, 0, 0}});
-  const std::array<int, 10> counts = {1, 0, 2, 0, 0, 0, 0, 1, 0, 1}, hits = {0, 0, 1, 0, 0, 0, 0, 0, 0, 1};
+  const std::array<int, 10> counts = {1, 0, 2, 0, 0, 0, 0, 1, 0, 1},
+                            hits = {0, 0, 1, 0, 0, 0, 0, 0, 0, 1};
   for (size_t i = 0; i < r.size(); ++i) {
     EXPECT_EQ(r[i].count, counts[i]);
     EXPECT_EQ(r[i].hits, hits[i]);
   }
   EXPECT_DOUBLE_EQ(r[2].sum_probability, .5);
-  EXPECT_DOUBLE_EQ(calibrationError(r), (2 * .25 + .75) / 5);  // bin 2: half are hits, not a quarter
+  EXPECT_DOUBLE_EQ(calibrationError(r),
+                   (2 * .25 + .75) / 5);  // bin 2: half are hits, not a quarter
   EXPECT_TRUE(std::isnan(calibrationError({})));
 }
 
@@ -187,10 +203,12 @@ TEST(Evaluate, MeansSumTheReliabilityAndDeviationsAreOfTheSample) {
   std::vector<MethodResult> results(4);
   for (size_t i = 0; i < results.size(); ++i) results[i].method = i < 3 ? "a" : "b";
   results[0].psnr = 20, results[1].psnr = 23, results[2].psnr = 26;
-  results[0].leak = .2, results[1].leak = .4, results[2].leak = std::numeric_limits<double>::quiet_NaN();
+  results[0].leak = .2, results[1].leak = .4,
+  results[2].leak = std::numeric_limits<double>::quiet_NaN();
   results[0].reliability.emplace(), results[1].reliability.emplace();
   (*results[0].reliability)[3] = {2, 1, .7}, (*results[1].reliability)[3] = {4, 1, 1.3};
-  const std::vector<MethodResult> means = meanResults(results), deviations = deviationResults(results);
+  const std::vector<MethodResult> means = meanResults(results),
+                                  deviations = deviationResults(results);
   ASSERT_EQ(means.size(), 2u);
   ASSERT_TRUE(means[0].reliability);
   EXPECT_EQ((*means[0].reliability)[3].count, 6);

@@ -216,33 +216,42 @@ TEST_F(RoomTest, RoomsAreClosed) {
 }
 
 TEST_F(RoomTest, ShellIsClosedAndFurnitureIsInPieces) {
-  constexpr float kReach = .25f;  // of what belongs to a wall, floor or ceiling: curtains, frames, handles
+  constexpr float kReach =
+      .25f;  // of what belongs to a wall, floor or ceiling: curtains, frames, handles
   for (const Room& room : rooms()) {
     ASSERT_EQ(room.is_shell.size(), room.surface.mesh.triangles.size());
     const Eigen::Isometry3f room_from_world = room.world_from_room.inverse();
     for (size_t t = 0; t < room.is_shell.size(); ++t)
       for (int corner = 0; corner < 3; ++corner) {
-        const Vector3f p = room_from_world * room.surface.mesh.vertices[size_t(room.surface.mesh.triangles[t][corner])];
+        const Vector3f p =
+            room_from_world *
+            room.surface.mesh.vertices[size_t(room.surface.mesh.triangles[t][corner])];
         if (!room.is_shell[t]) {
-          ASSERT_TRUE(std::any_of(room.pieces.begin(), room.pieces.end(), [&](const Piece& piece) {
-            return piece.box.exteriorDistance(p) < .01f;
-          })) << room.name << ": " << p.transpose();
+          ASSERT_TRUE(
+              std::any_of(room.pieces.begin(), room.pieces.end(),
+                          [&](const Piece& piece) { return piece.box.exteriorDistance(p) < .01f; }))
+              << room.name << ": " << p.transpose();
         } else if (isWithin(room, p)) {
           float to_wall = INFINITY;
           for (size_t i = 0, j = room.floor.size() - 1; i < room.floor.size(); j = i++) {
-            const Eigen::AlignedBox2f wall(room.floor[i].cwiseMin(room.floor[j]), room.floor[i].cwiseMax(room.floor[j]));
+            const Eigen::AlignedBox2f wall(room.floor[i].cwiseMin(room.floor[j]),
+                                           room.floor[i].cwiseMax(room.floor[j]));
             to_wall = std::min(to_wall, wall.exteriorDistance(Vector2f(p.head<2>())));
           }
-          ASSERT_LT(std::min({to_wall, p.z(), ceilingAt(room.ceilings, p.head<2>()) - p.z()}), kReach) << room.name;
+          ASSERT_LT(std::min({to_wall, p.z(), ceilingAt(room.ceilings, p.head<2>()) - p.z()}),
+                    kReach)
+              << room.name;
         }
       }
     const RayTarget shell = RayTarget::fromMesh(shellMesh(room));
     std::vector<Vector3f> origins, directions;
     for (const Vector3f& p : freePoints(room, 50, 6))
       for (int axis = 0; axis < 3; ++axis)
-        for (float side : {-1.f, 1.f}) origins.push_back(p), directions.push_back(side * Vector3f::Unit(axis));
+        for (float side : {-1.f, 1.f})
+          origins.push_back(p), directions.push_back(side * Vector3f::Unit(axis));
     const std::vector<float> hits = shell.trace(origins, directions);
-    EXPECT_TRUE(std::all_of(hits.begin(), hits.end(), [](float t) { return std::isfinite(t); })) << room.name;
+    EXPECT_TRUE(std::all_of(hits.begin(), hits.end(), [](float t) { return std::isfinite(t); }))
+        << room.name;
   }
 }
 

@@ -178,7 +178,7 @@ TEST(FitVolume, HoldsCamerasAndPointsTightlyInWholeCoarseNodes) {
     for (const Vector3d& p : pointsOf(capture)) ASSERT_TRUE(inside(p)) << p.transpose();
     for (const Camera& c : capture.cameras) EXPECT_TRUE(inside(c.world_from_camera.translation()));
     const Vector3d extent = room.box.sizes() + 2 * Vector3d(settings.margin_m, settings.margin_m,
-                                                          settings.vertical_margin_m);
+                                                            settings.vertical_margin_m);
     std::array<int, 3> dims{frame.bounds.dim().x(), frame.bounds.dim().y(), frame.bounds.dim().z()};
     if (std::abs(frame.world_from_grid.linear().col(0).dot(turned.col(0))) < 0.5)
       std::swap(dims[0], dims[1]);
@@ -731,9 +731,10 @@ TEST(TokenMaskVdb, HoldsTheNodesThatTheMaskReachesInTheWorld) {
   const openvdb::Vec3d at = box->worldToIndex(openvdb::Vec3d(centre.x(), centre.y(), centre.z()));
   const CoordBBox cells(Coord::round(at).offsetBy(-9, -5, -7), Coord::round(at).offsetBy(9, 5, 7));
   box->tree().sparseFill(cells, true, true);
-  EXPECT_EQ(nodesOf(box), nodesWhere(frame, [&](const Eigen::Vector3d& p) {
-              return cells.isInside(Coord::round(box->worldToIndex(openvdb::Vec3d(p.x(), p.y(), p.z()))));
-            }));
+  EXPECT_EQ(
+      nodesOf(box), nodesWhere(frame, [&](const Eigen::Vector3d& p) {
+        return cells.isInside(Coord::round(box->worldToIndex(openvdb::Vec3d(p.x(), p.y(), p.z()))));
+      }));
 }
 
 TEST(TokenMaskVdb, TakesTheGridNamedMaskAndRefusesPoints) {
@@ -745,9 +746,11 @@ TEST(TokenMaskVdb, TakesTheGridNamedMaskAndRefusesPoints) {
   other->setName("density"), mask->setName("mask");
   other->tree().setValueOn(Coord(0), 1), mask->tree().setValueOn(Coord(6, 6, 6), 0);
   openvdb::io::File(folder / "two.vdb").write({other, mask});
-  EXPECT_EQ(activeCoords(readTokenMask(folder / "two.vdb", frame, 1)), std::vector<Coord>{Coord(3)});
+  EXPECT_EQ(activeCoords(readTokenMask(folder / "two.vdb", frame, 1)),
+            std::vector<Coord>{Coord(3)});
   openvdb::io::File(folder / "one.vdb").write({other});
-  EXPECT_EQ(activeCoords(readTokenMask(folder / "one.vdb", frame, 1)), std::vector<Coord>{Coord(0)});
+  EXPECT_EQ(activeCoords(readTokenMask(folder / "one.vdb", frame, 1)),
+            std::vector<Coord>{Coord(0)});
   auto points = openvdb::points::PointDataGrid::create();
   openvdb::io::File(folder / "points.vdb").write({points});
   EXPECT_THROW(readTokenMask(folder / "points.vdb", frame, 1), Error);

@@ -29,7 +29,8 @@ inline void addBox(const Eigen::Vector3f& lo, const Eigen::Vector3f& hi, const M
         std::array<Eigen::Vector2f, 3> uv;
         const int corners[3] = {first, first + a, first + b};
         for (int c = 0; c < 3; ++c)
-          uv[size_t(c)] = {s->mesh.vertices[size_t(corners[c])][u], s->mesh.vertices[size_t(corners[c])][v]};
+          uv[size_t(c)] = {s->mesh.vertices[size_t(corners[c])][u],
+                           s->mesh.vertices[size_t(corners[c])][v]};
         s->uv.push_back(uv);
         s->normal.push_back({Vector3f::Zero(), Vector3f::Zero(), Vector3f::Zero()});
       }

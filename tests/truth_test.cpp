@@ -1,5 +1,5 @@
-// Truth of rooms on a grid, against sampling, exact clipping, flood-free brute force and the file read
-// back.
+// Truth of rooms on a grid, against sampling, exact clipping, flood-free brute force and the file
+// read back.
 #include <gtest/gtest.h>
 #include <openvdb/openvdb.h>
 
@@ -142,7 +142,6 @@ TEST(SurfaceNodes, AreInTreeOrder) {
   EXPECT_EQ(surfaceNodes(room.surface.mesh, frame, 2), grid.coords(2));
 }
 
-
 // --- roomTruth
 
 TEST(RoomTruth, FilledEmptyAndUnknownAreWhatTheBoxesSay) {
@@ -151,12 +150,14 @@ TEST(RoomTruth, FilledEmptyAndUnknownAreWhatTheBoxesSay) {
   const Eigen::Isometry3d room_from_world = room.world_from_room.cast<double>().inverse();
   int64_t empty = 0, unknown = 0;
   for (auto c = truth.frame.bounds.begin(); c; ++c) {
-    const bool filled = truth.space.filled.isValueOn(*c), is_empty = truth.space.empty.isValueOn(*c);
+    const bool filled = truth.space.filled.isValueOn(*c),
+               is_empty = truth.space.empty.isValueOn(*c);
     EXPECT_FALSE(filled && is_empty);
     if (filled) continue;
     // Without a surface in it, a voxel is all on one side: its centre tells.
     const Coord v = *c;
-    const Vector3d p = room_from_world * truth.frame.toWorld(Vector3d(v.x() + .5, v.y() + .5, v.z() + .5));
+    const Vector3d p =
+        room_from_world * truth.frame.toWorld(Vector3d(v.x() + .5, v.y() + .5, v.z() + .5));
     const bool in_room = p.minCoeff() > 0 && (p.cast<float>() - kSimpleRoomSize).maxCoeff() < 0;
     const bool in_thing = std::any_of(room.solids.begin(), room.solids.end(), [&](const auto& box) {
       return box.contains(p.cast<float>());
@@ -202,7 +203,8 @@ TEST(RoomTruth, FileHoldsEveryLevelAndTheDistanceToTheMesh) {
   const Room room = simpleRoom(6);
   const RoomTruth truth = roomTruth(room, .1f);
   const std::string path =
-      (std::filesystem::temp_directory_path() / ("vdbc_truth_" + std::to_string(getpid()) + ".vdb")).string();
+      (std::filesystem::temp_directory_path() / ("vdbc_truth_" + std::to_string(getpid()) + ".vdb"))
+          .string();
   writeTruth(room, truth, path);
   openvdb::io::File file(path);
   file.open();
@@ -220,11 +222,13 @@ TEST(RoomTruth, FileHoldsEveryLevelAndTheDistanceToTheMesh) {
   int64_t compared = 0;
   for (auto v = distance->cbeginValueOn(); v; ++v) {
     const openvdb::Vec3d w = distance->indexToWorld(v.getCoord());
-    const Vector3f p = (room.world_from_room.inverse() * Vector3d(w.x(), w.y(), w.z()).cast<float>());
+    const Vector3f p =
+        (room.world_from_room.inverse() * Vector3d(w.x(), w.y(), w.z()).cast<float>());
     float nearest = INFINITY;
     for (const auto& [lo, hi] : boxes) {
       const Vector3f outside = (lo - p).cwiseMax(p - hi);
-      nearest = std::min(nearest, outside.maxCoeff() < 0 ? -outside.maxCoeff() : outside.cwiseMax(0.f).norm());
+      nearest = std::min(
+          nearest, outside.maxCoeff() < 0 ? -outside.maxCoeff() : outside.cwiseMax(0.f).norm());
     }
     // OpenVDB's narrow band is exact next to the surface and propagated beyond: never too small.
     EXPECT_GT(*v, nearest - 2e-3f);

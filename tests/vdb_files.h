@@ -14,9 +14,11 @@ namespace vdbc {
 /// Behind what OpenVDB reads; other programs drop it.
 constexpr size_t kTrailerBytes = 16;
 
-/// Cuts the file at each of its first 300 and last 8 bytes before the trailer and at every `stride`th between.
+/// Cuts the file at each of its first 300 and last 8 bytes before the trailer and at every
+/// `stride`th between.
 template <typename Read>
-void expectEveryTruncationThrows(const std::string& file, const std::string& cut, size_t stride, Read read) {
+void expectEveryTruncationThrows(const std::string& file, const std::string& cut, size_t stride,
+                                 Read read) {
   const std::string bytes = bytesOf(file);
   ASSERT_GT(bytes.size(), 1000u);
   const size_t grids = bytes.size() - kTrailerBytes;

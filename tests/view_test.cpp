@@ -264,7 +264,8 @@ TEST_F(ViewFile, CamerasAloneNeedNoPictures) {
     const std::vector<View> expected = readViews(path("whole"));
     ASSERT_EQ(cameras.size(), 2u);
     for (size_t i = 0; i < 2; ++i) {
-      EXPECT_EQ(cameras[i].camera.world_from_camera.matrix(), expected[i].camera.world_from_camera.matrix());
+      EXPECT_EQ(cameras[i].camera.world_from_camera.matrix(),
+                expected[i].camera.world_from_camera.matrix());
       EXPECT_EQ(cameras[i].camera.width, 8);
       EXPECT_EQ(cameras[i].camera.height, 6);
       EXPECT_EQ(cameras[i].camera.fx, expected[i].camera.fx);

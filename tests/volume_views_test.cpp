@@ -31,7 +31,8 @@ constexpr double kCornerVoxels = 0.5;  // trilinear values round the corner wher
 
 /// A room with walls half a metre thick: `inner` is free, and so is what lies outside of `outer`.
 const Eigen::AlignedBox3d kInner(Vector3d(0.31, -1.02, 0.013), Vector3d(4.84, 2.37, 2.61));
-const Eigen::AlignedBox3d kOuter(kInner.min() - Vector3d::Constant(.5), kInner.max() + Vector3d::Constant(.5));
+const Eigen::AlignedBox3d kOuter(kInner.min() - Vector3d::Constant(.5),
+                                 kInner.max() + Vector3d::Constant(.5));
 
 Eigen::Isometry3d turned() {
   Eigen::Isometry3d world_from_room = Eigen::Isometry3d::Identity();
@@ -46,7 +47,9 @@ double boxDistance(const Eigen::AlignedBox3d& box, const Vector3d& p) {
   const Vector3d q = (p - box.center()).cwiseAbs() - box.sizes() / 2;
   return q.cwiseMax(0).norm() + std::min(q.maxCoeff(), 0.);
 }
-double roomHeight(const Vector3d& p) { return std::max(-boxDistance(kInner, p), boxDistance(kOuter, p)); }
+double roomHeight(const Vector3d& p) {
+  return std::max(-boxDistance(kInner, p), boxDistance(kOuter, p));
+}
 
 /// A cell-centred transform of cubic voxels.
 openvdb::math::Transform::Ptr transformOf(const Eigen::Isometry3d& world_from_room) {
@@ -157,10 +160,12 @@ Vector3d pointOf(const View& view, int x, int y, const Eigen::Isometry3d& world_
 /// Planar depth at which the ray of a pixel leaves the room.
 double depthOfWalls(const View& view, int x, int y, const Eigen::Isometry3d& world_from_room) {
   const Vector3d origin = world_from_room.inverse() * view.camera.world_from_camera.translation();
-  const Vector3d ray = world_from_room.inverse() * view.camera.unproject(x + .5, y + .5, 1) - origin;
+  const Vector3d ray =
+      world_from_room.inverse() * view.camera.unproject(x + .5, y + .5, 1) - origin;
   double z = std::numeric_limits<double>::max();
   for (int axis = 0; axis < 3; ++axis)
-    z = std::min(z, ((ray[axis] > 0 ? kInner.max() : kInner.min())[axis] - origin[axis]) / ray[axis]);
+    z = std::min(z,
+                 ((ray[axis] > 0 ? kInner.max() : kInner.min())[axis] - origin[axis]) / ray[axis]);
   return z;
 }
 
@@ -174,7 +179,8 @@ void expectRoom(const std::vector<View>& views, const Eigen::Isometry3d& world_f
     for (int y = 0; y < view.camera.height; ++y)
       for (int x = 0; x < view.camera.width; ++x) {
         const Vector3d p = pointOf(view, x, y, world_from_room);
-        ASSERT_LT(std::abs(boxDistance(kInner, p)), kCornerVoxels * kVoxelM) << view.name << " " << x << " " << y;
+        ASSERT_LT(std::abs(boxDistance(kInner, p)), kCornerVoxels * kVoxelM)
+            << view.name << " " << x << " " << y;
         const double z = double(view.depth[size_t(y) * size_t(view.camera.width) + size_t(x)]);
         errors.push_back(std::abs(z - depthOfWalls(view, x, y, world_from_room)));
       }
@@ -196,9 +202,13 @@ TEST_F(VolumeViews, LevelSetDepthIsTheWalls) {
   for (float value : views[0].colour.data) EXPECT_EQ(value, .5f);  // no Cd
 }
 
-TEST_F(VolumeViews, WorldIsTheFiles) { expectRoom(readViews(write({levelSetRoom(turned())})), turned()); }
+TEST_F(VolumeViews, WorldIsTheFiles) {
+  expectRoom(readViews(write({levelSetRoom(turned())})), turned());
+}
 
-TEST_F(VolumeViews, FogSurfaceIsHalfOfItsMaximum) { expectRoom(readViews(write({fogRoom(turned())})), turned()); }
+TEST_F(VolumeViews, FogSurfaceIsHalfOfItsMaximum) {
+  expectRoom(readViews(write({fogRoom(turned())})), turned());
+}
 
 TEST_F(VolumeViews, LevelSetComesBeforeFog) {
   auto fog = FloatGrid::create();
@@ -217,7 +227,8 @@ TEST_F(VolumeViews, CamerasSeeMostOfTheSurface) {
   for (const View& view : readViews(write({levelSetRoom(identity)})))
     for (int y = 0; y < view.camera.height; ++y)
       for (int x = 0; x < view.camera.width; ++x) {
-        const Vector3d wall = view.camera.unproject(x + .5, y + .5, depthOfWalls(view, x, y, identity));
+        const Vector3d wall =
+            view.camera.unproject(x + .5, y + .5, depthOfWalls(view, x, y, identity));
         seen.insert(patch(wall));
       }
   forVoxels([&](const Coord&, const Vector3d& p) {
@@ -240,7 +251,8 @@ TEST_F(VolumeViews, ColourIsTheSurfaces) {
         if (margin[1] < .2) continue;  // near an edge
         const openvdb::Vec3f expected = faceColour(faceOf(p));
         ++checked;
-        for (int c = 0; c < 3; ++c) ASSERT_NEAR(view.colour.at(x, y, c), srgbFromLinear(expected[c]), 1e-6);
+        for (int c = 0; c < 3; ++c)
+          ASSERT_NEAR(view.colour.at(x, y, c), srgbFromLinear(expected[c]), 1e-6);
       }
   EXPECT_GT(checked, 100000);
 }
@@ -267,7 +279,8 @@ TEST_F(VolumeViews, CutFacesAreNoSurface) {
           ASSERT_EQ(z, 0) << view.name << " " << x << " " << y;
         } else if (wall.x() < cut - 2 * kVoxelM) {
           ++hits;
-          ASSERT_LT(std::abs(boxDistance(kInner, pointOf(view, x, y, turned()))), kCornerVoxels * kVoxelM);
+          ASSERT_LT(std::abs(boxDistance(kInner, pointOf(view, x, y, turned()))),
+                    kCornerVoxels * kVoxelM);
         }
       }
   }
@@ -291,7 +304,8 @@ TEST_F(VolumeViews, OurFilesAreSeenFromSeenEmpty) {
     }
     v.ijk.push_back(ijk);
     v.colour_linear.emplace_back(.2f, .4f, ijk.z() < 2 ? 1.f : .1f);
-    v.density.push_back(1), v.observed.push_back(1), v.probability.push_back(1), v.bfs_level.push_back(0);
+    v.density.push_back(1), v.observed.push_back(1), v.probability.push_back(1),
+        v.bfs_level.push_back(0);
   }
   v.empty.root() = maskFromCoords(empty).root();
   const std::string path = folder_ / "ours.vdb";
@@ -307,9 +321,11 @@ TEST_F(VolumeViews, OurFilesAreSeenFromSeenEmpty) {
   for (const View& view : views) {
     const Vector3d p = v.frame.toIndex(view.camera.world_from_camera.translation());
     EXPECT_TRUE(known.isInside(Coord::floor(openvdb::Vec3d(p.x(), p.y(), p.z())))) << p.transpose();
-    for (size_t i = 0; i < view.depth.size(); ++i) EXPECT_NEAR(view.colour.data[3 * i], srgbFromLinear(.2f), 1e-6);
+    for (size_t i = 0; i < view.depth.size(); ++i)
+      EXPECT_NEAR(view.colour.data[3 * i], srgbFromLinear(.2f), 1e-6);
   }
-  expectEveryTruncationThrows(path, folder_ / "cut.vdb", 4099, [](const std::string& cut) { readViews(cut); });
+  expectEveryTruncationThrows(path, folder_ / "cut.vdb", 4099,
+                              [](const std::string& cut) { readViews(cut); });
 }
 
 TEST_F(VolumeViews, AreTheSameEachTime) {
@@ -356,27 +372,42 @@ TEST_F(VolumeViews, UnsuitableFilesThrow) {
     change(*grid);
     return grid;
   };
-  expectThrows(write({other([](FloatGrid& g) { g.setGridClass(openvdb::GRID_UNKNOWN); })}), "Tree_float_5_4_3");
+  expectThrows(write({other([](FloatGrid& g) { g.setGridClass(openvdb::GRID_UNKNOWN); })}),
+               "Tree_float_5_4_3");
   expectThrows(write({other([](FloatGrid& g) { g.clear(); })}), "is empty");
   expectThrows(write({other([](FloatGrid& g) {
                  g.tree().root().setBackground(1, true);
                  g.fill(CoordBBox(Coord(-60), Coord(60)), 1);
-               })}), "no surface");
+               })}),
+               "no surface");
   for (const double edge : {5e-5, 1e30})
     expectThrows(write({other([&](FloatGrid& g) {
                    g.setTransform(openvdb::math::Transform::createLinearTransform(edge));
-                 })}), "voxels of");
-  expectThrows(write({other([](FloatGrid& g) { g.transform().preScale(openvdb::Vec3d(1, 1, 1.1)); })}), "cubic");
-  expectThrows(write({other([](FloatGrid& g) { g.transform().preScale(openvdb::Vec3d(1, 1, -1)); })}), "mirrored");
+                 })}),
+                 "voxels of");
+  expectThrows(
+      write({other([](FloatGrid& g) { g.transform().preScale(openvdb::Vec3d(1, 1, 1.1)); })}),
+      "cubic");
+  expectThrows(
+      write({other([](FloatGrid& g) { g.transform().preScale(openvdb::Vec3d(1, 1, -1)); })}),
+      "mirrored");
   expectThrows(write({other([](FloatGrid& g) {
                  g.setTransform(openvdb::math::Transform::createFrustumTransform(
                      openvdb::BBoxd(openvdb::Vec3d(0), openvdb::Vec3d(100)), .5, 1, .05));
-               })}), "linear");
-  for (const float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()})
-    expectThrows(write({other([&](FloatGrid& g) { g.getAccessor().setValue(Coord(16, 0, 0), bad); })}), "not finite");
-  expectThrows(write({other([](FloatGrid& g) { g.tree().addTile(3, Coord(4096, 0, 0), -1, true); })}), "too large");
-  expectThrows(write({other([](FloatGrid& g) { g.tree().setValueOn(Coord(1 << 30, 0, 0), -1); })}), "origin");
-  expectThrows(write({openvdb::tools::createLevelSetSphere<FloatGrid>(.4f, {}, .04f)}), "no free place");
+               })}),
+               "linear");
+  for (const float bad :
+       {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()})
+    expectThrows(
+        write({other([&](FloatGrid& g) { g.getAccessor().setValue(Coord(16, 0, 0), bad); })}),
+        "not finite");
+  expectThrows(
+      write({other([](FloatGrid& g) { g.tree().addTile(3, Coord(4096, 0, 0), -1, true); })}),
+      "too large");
+  expectThrows(write({other([](FloatGrid& g) { g.tree().setValueOn(Coord(1 << 30, 0, 0), -1); })}),
+               "origin");
+  expectThrows(write({openvdb::tools::createLevelSetSphere<FloatGrid>(.4f, {}, .04f)}),
+               "no free place");
 
   auto fog = other([](FloatGrid& g) { g.setGridClass(openvdb::GRID_FOG_VOLUME); });
   fog->fill(CoordBBox(Coord(-60), Coord(60)), -1);
@@ -401,7 +432,8 @@ TEST_F(VolumeViews, UnsuitableFilesThrow) {
 /// A file of the team's collection, or nothing where it is not there.
 std::string sharedVolume(const std::string& name) {
   const char* shared = std::getenv("VDBC_SHARED");
-  const std::string folder = shared ? shared : VDBC_SOURCE_DIR "/../shared", path = folder + "/data/vdb/" + name;
+  const std::string folder = shared ? shared : VDBC_SOURCE_DIR "/../shared",
+                    path = folder + "/data/vdb/" + name;
   return std::filesystem::exists(path) ? path : std::string();
 }
 
@@ -422,7 +454,8 @@ void expectSphere(const std::string& path, double radius, double tolerance) {
 }
 
 TEST_F(VolumeViews, HoudiniSpheresAreRound) {
-  const std::string level_set = sharedVolume("sphere_levelset.vdb"), fog = sharedVolume("houdini_sphere_fog.vdb");
+  const std::string level_set = sharedVolume("sphere_levelset.vdb"),
+                    fog = sharedVolume("houdini_sphere_fog.vdb");
   if (level_set.empty() || fog.empty()) GTEST_SKIP() << "no shared volumes";
   expectSphere(level_set, 3, .02);
   expectSphere(fog, .9, .1);

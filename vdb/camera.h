@@ -12,8 +12,8 @@ struct Camera {
   /// Camera (x right, y down, z forward) to world, metres.
   Eigen::Isometry3d world_from_camera = Eigen::Isometry3d::Identity();
 
-  /// World point -> (u, v, z): pixel position and planar depth (metres). z <= 0 is behind the camera;
-  /// u and v are then meaningless.
+  /// World point -> (u, v, z): pixel position and planar depth (metres). z <= 0 is behind the
+  /// camera; u and v are then meaningless.
   Eigen::Vector3d project(const Eigen::Vector3d& p_world) const {
     const Eigen::Vector3d p = world_from_camera.inverse() * p_world;
     return {fx * p.x() / p.z() + cx, fy * p.y() / p.z() + cy, p.z()};

@@ -84,7 +84,8 @@ constexpr size_t kTrailerBytes = sizeof(kTrailerMagic) - 1 + sizeof(uint64_t);
 
 /// FNV-1a, 64 bits; `hash`: of the bytes before these.
 inline uint64_t fnv1a(const void* bytes, size_t size, uint64_t hash = 0xcbf29ce484222325u) {
-  for (size_t i = 0; i < size; ++i) hash = (hash ^ static_cast<const uint8_t*>(bytes)[i]) * 0x100000001b3u;
+  for (size_t i = 0; i < size; ++i)
+    hash = (hash ^ static_cast<const uint8_t*>(bytes)[i]) * 0x100000001b3u;
   return hash;
 }
 

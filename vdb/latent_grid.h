@@ -11,12 +11,12 @@ namespace vdbc {
 struct LatentGrid {
   VoxelFrame frame;
   int level = 1;
-  int dim = 0;                       // latent channels
-  std::vector<Coord> ijk;            // [N] in units of `level`
-  std::vector<float> z;              // [N, dim]
-  std::vector<uint8_t> observed;     // [N] 1: encoded from the views; 0: generated
-  std::vector<float> probability;    // [N] occupancy probability; 1 for observed
-  std::vector<int32_t> bfs_level;    // [N] growth level; 0 for observed
+  int dim = 0;                     // latent channels
+  std::vector<Coord> ijk;          // [N] in units of `level`
+  std::vector<float> z;            // [N, dim]
+  std::vector<uint8_t> observed;   // [N] 1: encoded from the views; 0: generated
+  std::vector<float> probability;  // [N] occupancy probability; 1 for observed
+  std::vector<int32_t> bfs_level;  // [N] growth level; 0 for observed
 
   int64_t size() const { return int64_t(ijk.size()); }
 };

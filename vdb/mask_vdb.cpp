@@ -43,21 +43,23 @@ TokenMask readTokenMask(const std::string& path, const VoxelFrame& frame, int le
   require(bool(transform), kRead, ": ", path,
           ": expected a grid of type bool, mask, float or vec3s, found none");
 
-  const CoordBBox nodes(tokenCoord(frame.bounds.min(), level), tokenCoord(frame.bounds.max(), level));
+  const CoordBBox nodes(tokenCoord(frame.bounds.min(), level),
+                        tokenCoord(frame.bounds.max(), level));
   const int side = 1 << level;
   std::vector<std::vector<Coord>> rows(size_t(nodes.dim().x()));
   tbb::parallel_for(size_t(0), rows.size(), [&](size_t x) {
     const openvdb::tree::ValueAccessor<const MaskTree, false> cells(mask);
     auto inside = [&](const Coord& voxel) {
-      const Eigen::Vector3d p = frame.toWorld(Eigen::Vector3d(voxel.x(), voxel.y(), voxel.z()).array() + .5);
-      return cells.isValueOn(transform->worldToIndexCellCentered(openvdb::Vec3d(p.x(), p.y(), p.z())));
+      const Eigen::Vector3d p =
+          frame.toWorld(Eigen::Vector3d(voxel.x(), voxel.y(), voxel.z()).array() + .5);
+      return cells.isValueOn(
+          transform->worldToIndexCellCentered(openvdb::Vec3d(p.x(), p.y(), p.z())));
     };
     for (int y = nodes.min().y(); y <= nodes.max().y(); ++y)
       for (int z = nodes.min().z(); z <= nodes.max().z(); ++z) {
         const Coord node(nodes.min().x() + int(x), y, z);
         bool any = false;
-        for (int v = 0; v < side * side * side && !any; ++v)
-          any = inside(voxelOf(node, side, v));
+        for (int v = 0; v < side * side * side && !any; ++v) any = inside(voxelOf(node, side, v));
         if (any) rows[x].push_back(node);
       }
   });
@@ -65,7 +67,8 @@ TokenMask readTokenMask(const std::string& path, const VoxelFrame& frame, int le
   openvdb::tree::ValueAccessor<TokenMask> set(tokens);
   for (const auto& row : rows)
     for (const Coord& node : row) set.setValueOn(node);
-  require(!tokens.empty(), kRead, ": ", path, ": holds no voxel of the place (expected the cameras' frame, metres)");
+  require(!tokens.empty(), kRead, ": ", path,
+          ": holds no voxel of the place (expected the cameras' frame, metres)");
   return tokens;
 }
 

@@ -203,12 +203,14 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
 
 void writeOccupancyVdb(const VoxelFrame& frame, const std::vector<std::vector<Coord>>& completions,
                        const std::string& path) {
-  require(!completions.empty(), "writeOccupancyVdb: ", path, ": expected one completion or more, found none");
+  require(!completions.empty(), "writeOccupancyVdb: ", path,
+          ": expected one completion or more, found none");
   openvdb::initialize();
   const auto mean = FloatGrid::create(), variance = FloatGrid::create();
   auto share = mean->getUnsafeAccessor();
   for (const std::vector<Coord>& voxels : completions)
-    for (const Coord& ijk : voxels) share.setValueOn(ijk, share.getValue(ijk) + 1);  // counts first: exact
+    for (const Coord& ijk : voxels)
+      share.setValueOn(ijk, share.getValue(ijk) + 1);  // counts first: exact
   auto spread = variance->getUnsafeAccessor();
   for (auto value = mean->beginValueOn(); value; ++value) {
     value.setValue(*value / float(completions.size()));

@@ -45,9 +45,9 @@ struct SceneVoxels {
   std::vector<Eigen::Vector3f> colour_linear;  // scene-linear Rec.709
   std::vector<float> density;                  // 0-1, opacity of the voxel
   std::vector<uint8_t> observed;               // 1: an input view saw it; 0: generated
-  std::vector<float> probability;              // its token's, which tau is compared with; 1 for observed
-  std::vector<int32_t> bfs_level;              // growth level, 0 for observed
-  TokenMask empty;                             // E of the input views (kept open in `surface`)
+  std::vector<float> probability;  // its token's, which tau is compared with; 1 for observed
+  std::vector<int32_t> bfs_level;  // growth level, 0 for observed
+  TokenMask empty;                 // E of the input views (kept open in `surface`)
 };
 
 /// Writes standard 5-4-3 grids: surface (level set), density (fog), Cd (vec3s), observed, generated
@@ -61,8 +61,8 @@ struct SceneVoxels {
 void writeSceneVdb(const SceneVoxels& voxels, const std::string& path);
 
 /// Several completions of one place, each as its voxels: float grids `occupancy_mean` and
-/// `occupancy_variance` (the share of them that fill a voxel, m, and m (1 - m)), cell-centred as above.
-/// Throws Error where the file cannot be written.
+/// `occupancy_variance` (the share of them that fill a voxel, m, and m (1 - m)), cell-centred as
+/// above. Throws Error where the file cannot be written.
 void writeOccupancyVdb(const VoxelFrame& frame, const std::vector<std::vector<Coord>>& completions,
                        const std::string& path);
 

@@ -56,7 +56,8 @@ inline Coord childCoord(const Coord& parent, int slot) {
 
 /// Voxel number `v`, 0 to side^3 - 1, of a node that is `side` voxels wide.
 inline Coord voxelOf(const Coord& node, int side, int v) {
-  return Coord(node.x() * side + v / (side * side), node.y() * side + v / side % side, node.z() * side + v % side);
+  return Coord(node.x() * side + v / (side * side), node.y() * side + v / side % side,
+               node.z() * side + v % side);
 }
 
 /// Rows of all tokens of a voxel topology and the maps between levels. Rows of each level are in

@@ -50,15 +50,16 @@ class MemoryBuffer : public std::streambuf {
   }
 };
 
-/// OpenVDB names each file by a random UUID. Ours are named by their content: the same place gives the
-/// same bytes.
+/// OpenVDB names each file by a random UUID. Ours are named by their content: the same place gives
+/// the same bytes.
 void nameByContent(std::string* archive) {
   constexpr size_t kUuidAt = 21, kUuidBytes = 36;  // behind magic, three versions and a flag; ASCII
   archive->replace(kUuidAt, kUuidBytes, kUuidBytes, '0');
   const std::string sum = hexOf(fnv1a(archive->data(), archive->size()));
   std::string name;
   for (size_t i = 0; name.size() < kUuidBytes; ++i) {
-    const bool dash = name.size() == 8 || name.size() == 13 || name.size() == 18 || name.size() == 23;
+    const bool dash =
+        name.size() == 8 || name.size() == 13 || name.size() == 18 || name.size() == 23;
     if (dash) name += '-';
     name += sum[i % sum.size()];
   }

@@ -21,13 +21,13 @@ struct ModelLight {
 /// its front, z up, origin in the middle of its footprint at its lowest point, metres.
 struct ModelInfo {
   std::string id, name, catalogue, category, creator, licence;
-  std::string role;                                         // models.tsv: what a room uses it as
-  Eigen::Vector3f size_m = Eigen::Vector3f::Zero();         // x width, y depth, z height
-  float elevation_m = 0;                                    // where it hangs by default
-  float top_m = 0;                                          // height at which things stand on it
+  std::string role;                                  // models.tsv: what a room uses it as
+  Eigen::Vector3f size_m = Eigen::Vector3f::Zero();  // x width, y depth, z height
+  float elevation_m = 0;                             // where it hangs by default
+  float top_m = 0;                                   // height at which things stand on it
   bool is_door_or_window = false;
-  bool is_held_out = false;                                 // models.tsv: never in training rooms
-  std::string fault;                                        // models.tsv: why it is not used; empty: usable
+  bool is_held_out = false;  // models.tsv: never in training rooms
+  std::string fault;         // models.tsv: why it is not used; empty: usable
   std::vector<ModelLight> lights;
 };
 
@@ -74,14 +74,15 @@ class AssetLibrary {
   std::unique_ptr<Impl> impl_;
 };
 
-/// What is wrong with a model, found by reading it: "" if nothing is. `note` tells of what was mended
-/// (a missing texture replaced by the diffuse colour, degenerate triangles dropped).
+/// What is wrong with a model, found by reading it: "" if nothing is. `note` tells of what was
+/// mended (a missing texture replaced by the diffuse colour, degenerate triangles dropped).
 std::string modelFault(const AssetLibrary& assets, size_t model, std::string* note);
 
 /// models.tsv of these catalogues: id, split, role and fault of every model, one line each.
 std::string modelTable(const AssetLibrary& assets);
 
-/// Attribution of every model and texture used, one line each, from the catalogues: docs/ATTRIBUTION.md.
+/// Attribution of every model and texture used, one line each, from the catalogues:
+/// docs/ATTRIBUTION.md.
 std::string attribution(const AssetLibrary& assets);
 
 /// models.tsv anew: roles as they are in it, faults found by reading every model, the split drawn.

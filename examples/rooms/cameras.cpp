@@ -28,7 +28,8 @@ float distanceToOutline(const std::vector<Vector2f>& outline, const Vector2f& p)
   float nearest = INFINITY;
   for (size_t i = 0, j = outline.size() - 1; i < outline.size(); j = i++) {
     const Vector2f d = outline[i] - outline[j];
-    const float t = std::clamp((p - outline[j]).dot(d) / std::max(d.squaredNorm(), 1e-12f), 0.f, 1.f);
+    const float t =
+        std::clamp((p - outline[j]).dot(d) / std::max(d.squaredNorm(), 1e-12f), 0.f, 1.f);
     nearest = std::min(nearest, (outline[j] + t * d - p).norm());
   }
   return nearest;
@@ -42,9 +43,10 @@ Eigen::AlignedBox2f footprint(const Room& room) {
   return box;
 }
 
-/// At `eye`, looking along the unit vector `forward`, turned by `roll` radians about it; room frame.
-Camera cameraAt(const Room& room, const Vector3d& eye, const Vector3d& forward, double roll, int width,
-                int height) {
+/// At `eye`, looking along the unit vector `forward`, turned by `roll` radians about it; room
+/// frame.
+Camera cameraAt(const Room& room, const Vector3d& eye, const Vector3d& forward, double roll,
+                int width, int height) {
   Camera camera;
   camera.width = width, camera.height = height;
   camera.fx = camera.fy = height / (2 * std::tan(kFieldOfView / 2));
@@ -54,9 +56,8 @@ Camera cameraAt(const Room& room, const Vector3d& eye, const Vector3d& forward, 
   room_from_camera << right, forward.cross(right), forward;
   // Rebuilt in double: the float pose of the room is orthonormal to 1e-7 only.
   const Eigen::Quaterniond yaw(room.world_from_room.linear().cast<double>());
-  camera.world_from_camera.linear() =
-      yaw.normalized().toRotationMatrix() * room_from_camera *
-      Eigen::AngleAxisd(roll, Vector3d::UnitZ()).toRotationMatrix();
+  camera.world_from_camera.linear() = yaw.normalized().toRotationMatrix() * room_from_camera *
+                                      Eigen::AngleAxisd(roll, Vector3d::UnitZ()).toRotationMatrix();
   camera.world_from_camera.translation() = room.world_from_room.cast<double>() * eye;
   return camera;
 }
@@ -75,7 +76,8 @@ std::vector<Vector3f> pointsSeen(const RayTarget& solid, const Camera& camera, i
     }
   *distances = solid.trace(origins, directions);
   for (size_t i = 0; i < origins.size(); ++i)
-    if (std::isfinite((*distances)[i])) points.push_back(origins[i] + (*distances)[i] * directions[i]);
+    if (std::isfinite((*distances)[i]))
+      points.push_back(origins[i] + (*distances)[i] * directions[i]);
   return points;
 }
 
@@ -114,8 +116,8 @@ std::vector<Camera> randomCameras(const Room& room, const RayTarget& solid, int 
   const Eigen::AlignedBox2f area = footprint(room);
   std::vector<Camera> cameras;
   for (int tries = 0; int(cameras.size()) < count; ++tries) {
-    require(tries < kTriesPerCamera * std::max(count, 10), room.name, ": expected a place for ", count,
-            " cameras, found one for ", cameras.size());
+    require(tries < kTriesPerCamera * std::max(count, 10), room.name, ": expected a place for ",
+            count, " cameras, found one for ", cameras.size());
     const double x = uniform(random, area.min().x(), area.max().x());
     const double y = uniform(random, area.min().y(), area.max().y());
     const double z = uniform(random, 1.1, 1.9);
@@ -170,12 +172,12 @@ std::vector<Camera> coveringCameras(const RayTarget& solid, const std::vector<Ca
   return chosen;
 }
 
-std::vector<Camera> roomCameras(const Room& room, const RoomRenderer& renderer, int count, int width,
-                                int height, uint64_t seed) {
+std::vector<Camera> roomCameras(const Room& room, const RoomRenderer& renderer, int count,
+                                int width, int height, uint64_t seed) {
   std::mt19937_64 random(seed);
   const RayTarget& solid = renderer.rayTarget();
-  std::vector<Camera> cameras = coveringCameras(
-      solid, randomCameras(room, solid, 4 * count, width, height, random), count);
+  std::vector<Camera> cameras =
+      coveringCameras(solid, randomCameras(room, solid, 4 * count, width, height, random), count);
   for (size_t i = cameras.size(); i-- > 1;) std::swap(cameras[i], cameras[random() % (i + 1)]);
   return cameras;
 }

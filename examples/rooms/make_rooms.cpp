@@ -1,5 +1,5 @@
-// make_rooms: furnished rooms as folders of RGB-D views with their truth, the example homes, contact
-// sheets and statistics.
+// make_rooms: furnished rooms as folders of RGB-D views with their truth, the example homes,
+// contact sheets and statistics.
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <chrono>
@@ -44,16 +44,19 @@ std::vector<uint64_t> seedList(const std::string& text) {
   for (std::string part; std::getline(parts, part, ',');) {
     unsigned long long first = 0, last = 0;
     int used = 0;
-    const bool digits = !part.empty() && part.find_first_not_of("0123456789-") == std::string::npos &&
+    const bool digits = !part.empty() &&
+                        part.find_first_not_of("0123456789-") == std::string::npos &&
                         part.front() != '-';
     const int found =
         digits ? std::sscanf(part.c_str(), "%llu%n-%llu%n", &first, &used, &last, &used) : 0;
     if (found == 1) last = first;
     if (found < 1 || size_t(used) != part.size() || last < first || last - first >= kMaxRooms)
-      throw UsageError(joinText("--seeds: ", text, ": expected numbers and ranges such as 3,10-19"));
+      throw UsageError(
+          joinText("--seeds: ", text, ": expected numbers and ranges such as 3,10-19"));
     for (uint64_t i = 0; i <= last - first; ++i) seeds.push_back(first + i);
   }
-  if (seeds.empty()) throw UsageError("--seeds: expected numbers and ranges such as 3,10-19, found nothing");
+  if (seeds.empty())
+    throw UsageError("--seeds: expected numbers and ranges such as 3,10-19, found nothing");
   return seeds;
 }
 
@@ -74,9 +77,14 @@ void writeAovs(const RoomPicture& p, const std::string& path) {
     if (!(z > 0)) z = kNoDepth;
   const float *c = p.radiance.data.data(), *n = p.normal.data.data();
   writeExr(p.view.camera,
-           {{"R", c, 3, true}, {"G", c + 1, 3, true}, {"B", c + 2, 3, true},
-            {"N.X", n, 3, true}, {"N.Y", n + 1, 3, true}, {"N.Z", n + 2, 3, true},
-            {"Z", depth.data(), 1, false}, {"material", material.data(), 1, false}},
+           {{"R", c, 3, true},
+            {"G", c + 1, 3, true},
+            {"B", c + 2, 3, true},
+            {"N.X", n, 3, true},
+            {"N.Y", n + 1, 3, true},
+            {"N.Z", n + 2, 3, true},
+            {"Z", depth.data(), 1, false},
+            {"material", material.data(), 1, false}},
            path);
 }
 
@@ -84,7 +92,8 @@ void writeAovs(const RoomPicture& p, const std::string& path) {
 Image writeRoom(const Room& room, uint64_t seed, const Options& o, const std::string& folder) {
   const int width = o.size.front(), height = o.size.back();
   const RoomRenderer renderer(room);
-  const std::vector<View> views = roomViews(room, renderer, o.views, width, height, o.samples, seed);
+  const std::vector<View> views =
+      roomViews(room, renderer, o.views, width, height, o.samples, seed);
   writeViews(views, folder);
   if (o.truth) {
     writeMesh(solidMesh(room.surface), folder + "/mesh.ply");
@@ -110,9 +119,11 @@ Image firstPicture(const std::string& folder) {
 
 void writeSheet(const std::vector<Image>& pictures, const std::string& folder) {
   const Image& first = pictures[0];
-  const int tile_height = std::max(1, int(std::lround(double(kTileSide) * first.height / first.width)));
+  const int tile_height =
+      std::max(1, int(std::lround(double(kTileSide) * first.height / first.width)));
   std::vector<Image> tiles;
-  for (const Image& picture : pictures) tiles.push_back(resizeImage(picture, kTileSide, tile_height));
+  for (const Image& picture : pictures)
+    tiles.push_back(resizeImage(picture, kTileSide, tile_height));
   writePng(contactSheet(tiles, kSheetColumns), folder + "/sheet.png");
 }
 
@@ -137,7 +148,8 @@ void makeHomes(const AssetLibrary& assets, const Options& o) {
   writeSheet(pictures, o.output);
 }
 
-// --- models ---------------------------------------------------------------------------------------
+// --- models
+// ---------------------------------------------------------------------------------------
 
 void addQuad(const std::array<Vector3f, 4>& p, SurfaceMesh* s) {
   const int first = int(s->mesh.vertices.size());
@@ -150,15 +162,19 @@ void addQuad(const std::array<Vector3f, 4>& p, SurfaceMesh* s) {
   }
 }
 
-// A model scaled to a unit box, in a corner of white walls under one lamp, seen from its front right.
+// A model scaled to a unit box, in a corner of white walls under one lamp, seen from its front
+// right.
 Image modelPicture(const AssetLibrary& assets, size_t model, int side) {
   Room room;
   room.name = assets.models()[model].id;
   room.surface.materials.push_back({});
   room.surface.materials[0].colour_a.setConstant(.7f);
-  addQuad({Vector3f(-2, -2, 0), Vector3f(2, -2, 0), Vector3f(2, 2, 0), Vector3f(-2, 2, 0)}, &room.surface);
-  addQuad({Vector3f(-2, -1, 0), Vector3f(-2, -1, 3), Vector3f(2, -1, 3), Vector3f(2, -1, 0)}, &room.surface);
-  addQuad({Vector3f(-1, -2, 0), Vector3f(-1, 2, 0), Vector3f(-1, 2, 3), Vector3f(-1, -2, 3)}, &room.surface);
+  addQuad({Vector3f(-2, -2, 0), Vector3f(2, -2, 0), Vector3f(2, 2, 0), Vector3f(-2, 2, 0)},
+          &room.surface);
+  addQuad({Vector3f(-2, -1, 0), Vector3f(-2, -1, 3), Vector3f(2, -1, 3), Vector3f(2, -1, 0)},
+          &room.surface);
+  addQuad({Vector3f(-1, -2, 0), Vector3f(-1, 2, 0), Vector3f(-1, 2, 3), Vector3f(-1, -2, 3)},
+          &room.surface);
   const float scale = 1 / assets.models()[model].size_m.maxCoeff();
   room.surface.append(*assets.mesh(model), Eigen::Affine3f(Eigen::Scaling(scale)));
   room.floor = {{-2, -2}, {2, -2}, {2, 2}, {-2, 2}};
@@ -170,7 +186,8 @@ Image modelPicture(const AssetLibrary& assets, size_t model, int side) {
   camera.width = camera.height = side;
   camera.fx = camera.fy = 1.7 * side;
   camera.cx = camera.cy = side / 2.;
-  const Eigen::Vector3d eye(1.5, 2.2, 1.5), forward = (Eigen::Vector3d(0, 0, .42) - eye).normalized();
+  const Eigen::Vector3d eye(1.5, 2.2, 1.5),
+      forward = (Eigen::Vector3d(0, 0, .42) - eye).normalized();
   const Eigen::Vector3d right = forward.cross(Eigen::Vector3d::UnitZ()).normalized();
   camera.world_from_camera.linear() << right, forward.cross(right), forward;
   camera.world_from_camera.translation() = eye;
@@ -189,12 +206,14 @@ void makeModelSheet(const AssetLibrary& assets, const std::string& path) {
   std::printf("%zu models\n", pictures.size());
 }
 
-// --- statistics -----------------------------------------------------------------------------------
+// --- statistics
+// -----------------------------------------------------------------------------------
 
 double floorArea(const Room& room) {
   double twice = 0;
   for (size_t i = 0, j = room.floor.size() - 1; i < room.floor.size(); j = i++)
-    twice += double(room.floor[j].x()) * room.floor[i].y() - double(room.floor[i].x()) * room.floor[j].y();
+    twice += double(room.floor[j].x()) * room.floor[i].y() -
+             double(room.floor[i].x()) * room.floor[j].y();
   return twice / 2;
 }
 
@@ -209,7 +228,9 @@ ordered_json seenShares(const RoomTruth& truth, const std::vector<View>& views, 
     if (truth.space.filled.isValueOn(*c) || truth.space.empty.isValueOn(*c))
       ++counts[seen.filled.isValueOn(*c) ? 0 : seen.empty.isValueOn(*c) ? 1 : 2];
   const double all = double(counts[0] + counts[1] + counts[2]);
-  return {{"F", double(counts[0]) / all}, {"E", double(counts[1]) / all}, {"U", double(counts[2]) / all}};
+  return {{"F", double(counts[0]) / all},
+          {"E", double(counts[1]) / all},
+          {"U", double(counts[2]) / all}};
 }
 
 struct Totals {
@@ -238,13 +259,19 @@ ordered_json statisticsOf(const AssetLibrary& assets, uint64_t seed, Totals* tot
     if (!p.model.empty()) models.insert(p.model), ++placed;
   ++totals->kinds[room.kind];
   totals->models.insert(models.begin(), models.end());
-  ordered_json j{{"room", room.name}, {"kind", room.kind},
-                 {"l_shaped", room.floor.size() > 4 ? 1. : 0.}, {"sloped", room.ceilings.size() > 1 ? 1. : 0.},
-                 {"floor_m2", floorArea(room)}, {"objects", double(placed)}, {"models", double(models.size())},
-                 {"triangles", double(room.surface.mesh.triangles.size())}, {"seconds", seconds}};
+  ordered_json j{{"room", room.name},
+                 {"kind", room.kind},
+                 {"l_shaped", room.floor.size() > 4 ? 1. : 0.},
+                 {"sloped", room.ceilings.size() > 1 ? 1. : 0.},
+                 {"floor_m2", floorArea(room)},
+                 {"objects", double(placed)},
+                 {"models", double(models.size())},
+                 {"triangles", double(room.surface.mesh.triangles.size())},
+                 {"seconds", seconds}};
   for (int count : {2, kViews}) {
     const ordered_json shares = seenShares(truth, views, count);
-    for (const auto& [state, share] : shares.items()) j[state + "_" + std::to_string(count)] = share;
+    for (const auto& [state, share] : shares.items())
+      j[state + "_" + std::to_string(count)] = share;
   }
   for (const auto& [key, value] : j.items())
     if (value.is_number()) totals->values[key].push_back(value.get<double>());
@@ -259,7 +286,8 @@ void printStatistics(const AssetLibrary& assets, const Options& o) {
     std::printf("%s\n", statisticsOf(assets, seed, &totals).dump().c_str());
     std::fflush(stdout);
   }
-  ordered_json all{{"rooms", seeds.size()}, {"models_used", totals.models.size()}, {"kinds", totals.kinds}};
+  ordered_json all{
+      {"rooms", seeds.size()}, {"models_used", totals.models.size()}, {"kinds", totals.kinds}};
   for (auto& [key, values] : totals.values) {
     const auto [least, most] = std::minmax_element(values.begin(), values.end());
     double sum = 0;
@@ -269,13 +297,20 @@ void printStatistics(const AssetLibrary& assets, const Options& o) {
   std::printf("%s\n", all.dump().c_str());
 }
 
-// --- program --------------------------------------------------------------------------------------
+// --- program
+// --------------------------------------------------------------------------------------
 
 void addPictures(CLI::App* verb, Options* o) {
-  verb->add_option("--views", o->views, "pictures a room")->check(CLI::Range(1, 1000))->capture_default_str();
+  verb->add_option("--views", o->views, "pictures a room")
+      ->check(CLI::Range(1, 1000))
+      ->capture_default_str();
   verb->add_option("--size", o->size, "pixels: width, or width and height")
-      ->expected(1, 2)->check(CLI::Range(8, 4096))->capture_default_str();
-  verb->add_option("--samples", o->samples, "paths a pixel")->check(CLI::Range(1, 65536))->capture_default_str();
+      ->expected(1, 2)
+      ->check(CLI::Range(8, 4096))
+      ->capture_default_str();
+  verb->add_option("--samples", o->samples, "paths a pixel")
+      ->check(CLI::Range(1, 65536))
+      ->capture_default_str();
   verb->add_flag("--truth", o->truth, "mesh.ply and truth.vdb of each room too");
   verb->add_flag("--aovs", o->aovs, "aovs.####.exr too: scene-linear colour, normal, Z, material");
 }
@@ -284,17 +319,26 @@ int run(int argc, char** argv) {
   Options o;
   CLI::App app{"Furnished rooms from Sweet Home 3D's Debian packages, path-traced.", "make_rooms"};
   app.require_subcommand(1);
-  CLI::App* rooms = app.add_subcommand("rooms", "furnished rooms: OUTPUT/SEED/transforms.json, ... and OUTPUT/sheet.png");
-  rooms->add_option("--seeds", o.seeds, joinText("which, 3,10-19 say; from ", kFirstTrainingSeed, " on with training models"))->required();
+  CLI::App* rooms = app.add_subcommand(
+      "rooms", "furnished rooms: OUTPUT/SEED/transforms.json, ... and OUTPUT/sheet.png");
+  rooms
+      ->add_option(
+          "--seeds", o.seeds,
+          joinText("which, 3,10-19 say; from ", kFirstTrainingSeed, " on with training models"))
+      ->required();
   CLI::App* homes = app.add_subcommand("homes", "the rooms of the nine example homes, likewise");
   CLI::App* models = app.add_subcommand("models", "contact sheet (PNG) of all usable models");
-  CLI::App* statistics = app.add_subcommand("statistics", "one JSON line a room: contents, and what views see of it");
+  CLI::App* statistics =
+      app.add_subcommand("statistics", "one JSON line a room: contents, and what views see of it");
   statistics->add_option("--seeds", o.seeds, "which rooms, 3,10-19 say")->required();
-  CLI::App* credits = app.add_subcommand("attribution", "creators and licences of all usable models (Markdown)");
-  CLI::App* table = app.add_subcommand("table", "models.tsv anew: split, role and fault of every model");
+  CLI::App* credits =
+      app.add_subcommand("attribution", "creators and licences of all usable models (Markdown)");
+  CLI::App* table =
+      app.add_subcommand("table", "models.tsv anew: split, role and fault of every model");
   for (CLI::App* verb : {rooms, homes}) addPictures(verb, &o);
   for (CLI::App* verb : {rooms, homes, models})
-    verb->add_option("-o,--output", o.output, verb == models ? "PNG to write" : "folder to write")->required();
+    verb->add_option("-o,--output", o.output, verb == models ? "PNG to write" : "folder to write")
+        ->required();
   try {
     app.parse(argc, argv);
     const AssetLibrary assets = AssetLibrary::open();

@@ -1124,7 +1124,8 @@ void RoomRenderer::Impl::occlude(Packet* packet) const {
 }
 
 template <typename Rejects>
-void RoomRenderer::Impl::filterHits(const RTCFilterFunctionNArguments* args, const Rejects& rejects) {
+void RoomRenderer::Impl::filterHits(const RTCFilterFunctionNArguments* args,
+                                    const Rejects& rejects) {
   const Query& query = *reinterpret_cast<const Query*>(args->context);
   const Impl& self = *query.renderer;
   for (unsigned i = 0; i < args->N; ++i) {
@@ -1140,13 +1141,15 @@ void RoomRenderer::Impl::filterHits(const RTCFilterFunctionNArguments* args, con
 
 bool RoomRenderer::Impl::isCutOut(const Candidate& hit) const {
   const MipTexture* texture = texture_of[hit.material];
-  return texture && texture->hasAlpha() && texture->coverage(uvAt(hit.triangle, hit.u, hit.v)) < .5f;
+  return texture && texture->hasAlpha() &&
+         texture->coverage(uvAt(hit.triangle, hit.u, hit.v)) < .5f;
 }
 
 void RoomRenderer::Impl::intersectFilter(const RTCFilterFunctionNArguments* args) {
   filterHits(args, [](const Query& query, const Candidate& hit) {
     const Impl& self = *query.renderer;
-    return (query.only_solid && self.surface.materials[hit.material].opacity < kSolidOpacity) || self.isCutOut(hit);
+    return (query.only_solid && self.surface.materials[hit.material].opacity < kSolidOpacity) ||
+           self.isCutOut(hit);
   });
 }
 

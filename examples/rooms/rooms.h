@@ -24,33 +24,35 @@ struct RoomLight {
 
 /// The sun: parallel light that comes in where it meets a window's pane (a material with emission).
 struct Sun {
-  Eigen::Vector3f towards = Eigen::Vector3f::UnitZ();     // unit, world
-  Eigen::Vector3f irradiance = Eigen::Vector3f::Zero();   // on a plane across it, scene-linear; 0: none
+  Eigen::Vector3f towards = Eigen::Vector3f::UnitZ();  // unit, world
+  Eigen::Vector3f irradiance =
+      Eigen::Vector3f::Zero();  // on a plane across it, scene-linear; 0: none
 };
 
 /// A piece of furniture in a room.
 struct Piece {
-  std::string model;                                      // catalogue id; "" of what the room builds itself
+  std::string model;  // catalogue id; "" of what the room builds itself
   Eigen::Affine3f room_from_model = Eigen::Affine3f::Identity();
-  Eigen::AlignedBox3f box;                                // of its vertices; room frame
+  Eigen::AlignedBox3f box;  // of its vertices; room frame
 };
 
 /// A room: world +Z up, metres, floor at z = 0 of the room frame. The surface and the lights are in
 /// the world frame; floor, ceilings, pieces and solids in the room's own frame.
 struct Room {
   std::string name;  // "rooms:17", "homes:3"
-  std::string kind;  // bedroom, living, dining, study, kitchen, bathroom, office; of a home its own name
+  std::string
+      kind;  // bedroom, living, dining, study, kitchen, bathroom, office; of a home its own name
   Eigen::Isometry3f world_from_room = Eigen::Isometry3f::Identity();  // yaw about +Z and place
   SurfaceMesh surface;
-  /// [T] 1: of the shell (floors, ceilings, walls, skirting, doors, windows and their curtains); 0: of what stands,
-  /// lies or hangs in it. Empty where that is not known.
+  /// [T] 1: of the shell (floors, ceilings, walls, skirting, doors, windows and their curtains); 0:
+  /// of what stands, lies or hangs in it. Empty where that is not known.
   std::vector<uint8_t> is_shell;
   std::vector<RoomLight> lights;
   Sun sun;
-  std::vector<Eigen::Vector2f> floor;        // outline, counter-clockwise from above
-  std::vector<Eigen::Vector3f> ceilings;     // z < a x + b y + c for each (a, b, c)
+  std::vector<Eigen::Vector2f> floor;     // outline, counter-clockwise from above
+  std::vector<Eigen::Vector3f> ceilings;  // z < a x + b y + c for each (a, b, c)
   std::vector<Piece> pieces;
-  std::vector<Eigen::AlignedBox3f> solids;   // what can't be walked or looked through
+  std::vector<Eigen::AlignedBox3f> solids;  // what can't be walked or looked through
 };
 
 /// Training rooms have seeds from here on, and only models that are not held out; rooms of lower
@@ -58,32 +60,33 @@ struct Room {
 constexpr uint64_t kFirstTrainingSeed = 1000000;
 
 /// A furnished room: walls, floor, ceiling (now and then sloped), skirting, doors, windows, rugs,
-/// pictures, lamps, and furniture placed by the rules of its kind, without interpenetration and with
-/// walkable space left; rectangular or L-shaped; yaw and place in the world random, so that nothing
-/// learns to lean on the axes. Throws Error.
+/// pictures, lamps, and furniture placed by the rules of its kind, without interpenetration and
+/// with walkable space left; rectangular or L-shaped; yaw and place in the world random, so that
+/// nothing learns to lean on the axes. Throws Error.
 Room makeRoom(const AssetLibrary& assets, uint64_t seed);
 
 /// Number of furnished rooms in the jar's example homes, and one of them with its whole home around
 /// it: layouts by people, held out. Throws Error.
 int homeRoomCount(const AssetLibrary& assets);
 Room homeRoom(const AssetLibrary& assets, int index);
-/// The furnished rooms of a .sh3d file (Sweet Home 3D 5.3 or newer), whose furniture has to be in the
-/// catalogues. Throws Error.
+/// The furnished rooms of a .sh3d file (Sweet Home 3D 5.3 or newer), whose furniture has to be in
+/// the catalogues. Throws Error.
 std::vector<Room> readHome(const AssetLibrary& assets, const std::string& sh3d_path);
 
 /// Whether a point of the room frame is in the room's air, at least margin_m from its walls, floor,
 /// ceilings and solids.
 bool isFree(const Room& room, const Eigen::Vector3f& p_room, float margin_m);
 
-/// Whether a point of the room frame is over the room's floor and below its ceilings, in furniture or not.
+/// Whether a point of the room frame is over the room's floor and below its ceilings, in furniture
+/// or not.
 bool isWithin(const Room& room, const Eigen::Vector3f& p_room);
 
 /// The solid triangles (solidMesh) of the shell, world frame. Throws Error where is_shell is empty.
 TriangleMesh shellMesh(const Room& room);
 
 /// Random cameras in free space at human heights (1.1-1.9 m), looking roughly level, vertical field
-/// of view 70 degrees, whose view is not blocked by something near. `solid` is the room's solidMesh.
-/// Throws Error where the room has no place for them.
+/// of view 70 degrees, whose view is not blocked by something near. `solid` is the room's
+/// solidMesh. Throws Error where the room has no place for them.
 std::vector<Camera> randomCameras(const Room& room, const RayTarget& solid, int count, int width,
                                   int height, std::mt19937_64& random);
 
@@ -97,10 +100,11 @@ std::vector<Camera> coveringCameras(const RayTarget& solid, const std::vector<Ca
 
 /// Everything a renderer knows of a view.
 struct RoomPicture {
-  View view;                      // colour: display sRGB, tone-mapped; planar depth
-  Image radiance;                 // [H, W, 3] scene-linear, exposed, before the tone curve
-  Image normal;                   // [H, W, 3] world, unit, towards the camera; 0 where nothing is hit
-  std::vector<int32_t> material;  // [H * W] index into the surface's materials; -1 where nothing is hit
+  View view;       // colour: display sRGB, tone-mapped; planar depth
+  Image radiance;  // [H, W, 3] scene-linear, exposed, before the tone curve
+  Image normal;    // [H, W, 3] world, unit, towards the camera; 0 where nothing is hit
+  std::vector<int32_t>
+      material;  // [H * W] index into the surface's materials; -1 where nothing is hit
 };
 
 /// Embree scene of a room; keep it to render many views.
@@ -110,8 +114,8 @@ class RoomRenderer {
   ~RoomRenderer();
   RoomRenderer(RoomRenderer&&) noexcept;
 
-  /// Path-traced picture: `samples` a pixel, the same for the same seed whatever the threads. Depth,
-  /// normal and material are of the pixel's centre ray and exact: the first solid surface.
+  /// Path-traced picture: `samples` a pixel, the same for the same seed whatever the threads.
+  /// Depth, normal and material are of the pixel's centre ray and exact: the first solid surface.
   RoomPicture picture(const Camera& camera, int samples, uint64_t seed) const;
   View render(const Camera& camera, int samples, uint64_t seed) const;
   /// Depth alone, without colour: cheap.
@@ -129,10 +133,10 @@ class RoomRenderer {
 /// Samples a pixel: 30 dB or more against 4,096 in most rooms at 224 x 224 (docs/rooms.md).
 constexpr int kRoomSamples = 8;
 
-/// `count` cameras in a room, the covering ones of four times as many random ones, in random order: any
-/// first n of them are a random choice. The same for the same seed.
-std::vector<Camera> roomCameras(const Room& room, const RoomRenderer& renderer, int count, int width,
-                                int height, uint64_t seed);
+/// `count` cameras in a room, the covering ones of four times as many random ones, in random order:
+/// any first n of them are a random choice. The same for the same seed.
+std::vector<Camera> roomCameras(const Room& room, const RoomRenderer& renderer, int count,
+                                int width, int height, uint64_t seed);
 /// Their pictures; the i-th is rendered with seed + i.
 std::vector<View> roomViews(const Room& room, const RoomRenderer& renderer, int count, int width,
                             int height, int samples, uint64_t seed);
@@ -149,7 +153,7 @@ std::vector<Coord> surfaceNodes(const TriangleMesh& mesh, const VoxelFrame& fram
 /// grid is aligned with the room and holds it with a margin of one coarse node.
 struct RoomTruth {
   VoxelFrame frame;
-  ObservedSpace space;                                        // level 0
+  ObservedSpace space;                                         // level 0
   std::array<std::vector<Coord>, kTokenLevels> surface_nodes;  // occupancy by level, in the bounds
 };
 RoomTruth roomTruth(const Room& room, float voxel_m);

@@ -33,9 +33,9 @@ struct Material {
   std::shared_ptr<const Texture> texture;  // instead of a pattern; repeats, u right, v up
   float specular = 0.f;                    // reflectance of the gloss at normal incidence, 0-1
   float roughness = .5f;                   // of the gloss: 0 mirror, 1 matt
-  float opacity = 1.f;                     // share of light that is stopped; the rest goes straight on
-  float emission = 0.f;                    // radiance as a factor of the colour: windows, lamp shades
-  std::string name;                        // in its model's files: homes recolour by it
+  float opacity = 1.f;   // share of light that is stopped; the rest goes straight on
+  float emission = 0.f;  // radiance as a factor of the colour: windows, lamp shades
+  std::string name;      // in its model's files: homes recolour by it
 };
 
 /// Materials of opacity below this are glass to a depth camera and to truth: seen through.

@@ -131,9 +131,9 @@ VoxelFrame truthFrame(const Room& room, float voxel_m) {
 /// Nodes of `level` inside the bounds.
 std::vector<Coord> clipped(std::vector<Coord> nodes, const CoordBBox& bounds, int level) {
   const CoordBBox box(tokenCoord(bounds.min(), level), tokenCoord(bounds.max(), level));
-  nodes.erase(std::remove_if(nodes.begin(), nodes.end(),
-                             [&](const Coord& c) { return !box.isInside(c); }),
-              nodes.end());
+  nodes.erase(
+      std::remove_if(nodes.begin(), nodes.end(), [&](const Coord& c) { return !box.isInside(c); }),
+      nodes.end());
   return nodes;
 }
 
@@ -181,12 +181,14 @@ FloatGrid::Ptr distanceGrid(const TriangleMesh& mesh, const VoxelFrame& frame) {
   std::vector<openvdb::Vec3s> points;
   std::vector<openvdb::Vec3I> triangles;
   for (const Vector3f& v : mesh.vertices) {
-    const Vector3d p = frame.toIndex(v.cast<double>()).array() - .5;  // voxel centres at whole indices
+    const Vector3d p =
+        frame.toIndex(v.cast<double>()).array() - .5;  // voxel centres at whole indices
     points.emplace_back(float(p.x()), float(p.y()), float(p.z()));
   }
   for (const Eigen::Vector3i& t : mesh.triangles)
     triangles.emplace_back(uint32_t(t[0]), uint32_t(t[1]), uint32_t(t[2]));
-  const openvdb::tools::QuadAndTriangleDataAdapter<openvdb::Vec3s, openvdb::Vec3I> data(points, triangles);
+  const openvdb::tools::QuadAndTriangleDataAdapter<openvdb::Vec3s, openvdb::Vec3I> data(points,
+                                                                                        triangles);
   const auto transform = fileTransform(frame, 0);
   FloatGrid::Ptr grid = openvdb::tools::meshToVolume<FloatGrid>(
       data, *transform, kBandVoxels, kBandVoxels, openvdb::tools::UNSIGNED_DISTANCE_FIELD);
@@ -197,12 +199,14 @@ FloatGrid::Ptr distanceGrid(const TriangleMesh& mesh, const VoxelFrame& frame) {
 }  // namespace
 
 TriangleMesh shellMesh(const Room& room) {
-  require(room.is_shell.size() == room.surface.mesh.triangles.size(), room.name, ": expected to know which of ",
-          room.surface.mesh.triangles.size(), " triangles are of the shell, found ", room.is_shell.size());
+  require(room.is_shell.size() == room.surface.mesh.triangles.size(), room.name,
+          ": expected to know which of ", room.surface.mesh.triangles.size(),
+          " triangles are of the shell, found ", room.is_shell.size());
   TriangleMesh shell;
   shell.vertices = room.surface.mesh.vertices;
   for (size_t i = 0; i < room.is_shell.size(); ++i)
-    if (room.is_shell[i] && room.surface.materials[size_t(room.surface.material[i])].opacity >= kSolidOpacity)
+    if (room.is_shell[i] &&
+        room.surface.materials[size_t(room.surface.material[i])].opacity >= kSolidOpacity)
       shell.triangles.push_back(room.surface.mesh.triangles[i]);
   return shell;
 }
