@@ -91,8 +91,8 @@ const EncoderConfig& Encoder::config() const { return impl_->net->config; }
 std::string Encoder::hash() const { return impl_->hash; }
 std::string Encoder::trainedOn() const { return impl_->trained_on; }
 
-ObservationSettings Encoder::observationSettings() const {
-  ObservationSettings s;
+ObserveSettings Encoder::observing(ObserveSettings s) const {
+  s.volume.voxel_m = config().voxel_m;
   s.patches_across = config().patches_across;
   s.level = config().levels;
   return s;
@@ -103,8 +103,8 @@ std::vector<float> Encoder::colourWay() const {
   return {w.data_ptr<float>(), w.data_ptr<float>() + w.numel()};
 }
 
-LatentGrid Encoder::encode(const std::vector<View>& views, const Observation& o,
-                           Progress& progress) const {
+Place Encoder::encode(const std::vector<View>& views, const Observation& o,
+                      Progress& progress) const {
   torch::NoGradGuard no_grad;
   report(progress, -1);
   const EncoderConfig& c = config();
@@ -113,14 +113,15 @@ LatentGrid Encoder::encode(const std::vector<View>& views, const Observation& o,
                        .to(torch::kHalf)
                        .to(torch::kFloat32)
                        .contiguous();
-  LatentGrid grid;
-  grid.frame = o.frame, grid.level = c.levels, grid.dim = c.latent_dim;
-  grid.ijk = o.tokens.coords(c.levels);
-  grid.z.assign(z.data_ptr<float>(), z.data_ptr<float>() + z.numel());
-  grid.observed.assign(grid.ijk.size(), 1);
-  grid.probability.assign(grid.ijk.size(), 1.f);
-  grid.bfs_level.assign(grid.ijk.size(), 0);
-  return grid;
+  Place place;
+  place.frame = o.frame, place.seen = o.seen, place.encoder_hash = hash();
+  place.level = c.levels, place.dim = c.latent_dim;
+  place.ijk = o.tokens.coords(c.levels);
+  place.z.assign(z.data_ptr<float>(), z.data_ptr<float>() + z.numel());
+  place.probability.assign(place.ijk.size(), 1.f);
+  place.bfs_level.assign(place.ijk.size(), 0);
+  place.generated.assign(place.ijk.size(), 0);
+  return place;
 }
 
 namespace {
@@ -154,22 +155,20 @@ void copyToWorld(const GaussianTensors& t, const VoxelFrame& frame, size_t first
 
 }  // namespace
 
-DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen,
-                            float child_threshold, Progress& progress) const {
+DecodedGrid Encoder::decode(const Place& place, float child_threshold, Progress& progress) const {
   torch::NoGradGuard no_grad;
   const EncoderConfig& c = config();
-  require(latents.dim == c.latent_dim && latents.level == c.levels,
-          "Encoder::decode: the latent grid: expected ", c.latent_dim, " channels at level ",
-          c.levels, ", found ", latents.dim, " at level ", latents.level);
+  require(place.dim == c.latent_dim && place.level == c.levels,
+          "Encoder::decode: the place: expected ", c.latent_dim, " channels at level ", c.levels,
+          ", found ", place.dim, " at level ", place.level);
   DecodedGrid out;
-  if (latents.size() == 0) {
+  if (place.size() == 0) {
     out.gaussians.resize(0, 0);
     return out;
   }
-  std::vector<Coord> coords = latents.ijk;
-  DecoderTokens tokens =
-      impl_->net->decodeTokens(torch::tensor(latents.z).view({latents.size(), latents.dim}),
-                               coordTensor(coords), zOrder(coords));
+  std::vector<Coord> coords = place.ijk;
+  DecoderTokens tokens = impl_->net->decodeTokens(
+      torch::tensor(place.z).view({place.size(), place.dim}), coordTensor(coords), zOrder(coords));
   report(progress, -1);
 
   std::vector<int32_t> node(coords.size());
@@ -178,7 +177,8 @@ DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen
   for (int split = 0; split < c.levels; ++split) {
     const Tensor p = impl_->net->childLogits(tokens, split).sigmoid().contiguous();
     const auto chance = p.accessor<float, 2>();
-    openvdb::tree::ValueAccessor<const TokenMask> filled(seen.filled), empty(seen.empty);
+    openvdb::tree::ValueAccessor<const TokenMask> filled(place.seen->filled),
+        empty(place.seen->empty);
     const int side = 1 << (c.levels - 1 - split);  // of a child, in voxels
     auto activeBelow = [&](const auto& mask, const Coord& child) {
       int active = 0;
@@ -224,8 +224,8 @@ DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen
   for (int64_t begin = 0; begin < voxels; begin += kChunk) {
     const int64_t end = std::min(voxels, begin + kChunk);
     copyToWorld(impl_->net->gaussians(tokens.rows(begin, end), all_coords.slice(0, begin, end),
-                                      latents.frame.voxel_m),
-                latents.frame, size_t(begin * m), &out.gaussians);
+                                      place.frame.voxel_m),
+                place.frame, size_t(begin * m), &out.gaussians);
     report(progress, int(100 * end / voxels));
   }
   out.voxels = std::move(coords), out.node = std::move(node);

@@ -6,7 +6,7 @@
 #include "encoder/observation.h"
 #include "splat/gaussian_io.h"
 #include "splat/gaussians.h"
-#include "vdb/latent_grid.h"
+#include "vdb/place.h"
 
 namespace vdbc {
 
@@ -61,22 +61,22 @@ class Encoder {
   std::string hash() const;
   /// The scenes it was trained on, as the file says (`rooms:SEED-SEED`).
   std::string trainedOn() const;
-  ObservationSettings observationSettings() const;
+  /// What observe() needs for encode(): `settings` with the grid, patches and level of the weights.
+  ObserveSettings observing(ObserveSettings settings = {}) const;
 
-  /// Latents (posterior means, normalised, rounded to half precision) of the observed tokens. Spec
-  /// E14: the same for condition and target views.
-  LatentGrid encode(const std::vector<View>& views, const Observation& observation,
-                    Progress& progress) const;
+  /// The place as observed: latents (posterior means, normalised, rounded to half precision) of the
+  /// observed tokens. The same for condition and target views.
+  Place encode(const std::vector<View>& views, const Observation& observation,
+               Progress& progress) const;
 
   /// What the decoder's linear way makes of a latent, the mean colours of its octants: [24 *
   /// latent_dim], a row a channel (opponent colours).
   std::vector<float> colourWay() const;
 
-  /// Splits every token and makes M Gaussians a voxel. Voxels in `seen.filled` are kept exactly, in
-  /// observed nodes nothing that `seen.empty` holds is filled, other children where BCE-up exceeds
-  /// `child_threshold`; a generated token keeps at least its likeliest child.
-  DecodedGrid decode(const LatentGrid& latents, const ObservedSpace& seen, float child_threshold,
-                     Progress& progress) const;
+  /// Splits every token and makes M Gaussians a voxel. Voxels in `seen->filled` are kept exactly,
+  /// in observed nodes nothing that `seen->empty` holds is filled, other children where BCE-up
+  /// exceeds `child_threshold`; a generated token keeps at least its likeliest child.
+  DecodedGrid decode(const Place& place, float child_threshold, Progress& progress) const;
 
  private:
   struct Impl;

@@ -8,7 +8,6 @@
 #include "encoder/network.h"
 #include "encoder/trainer.h"
 #include "splat/rasterize_torch.h"
-#include "vdb/scene_volume.h"
 
 namespace vdbc {
 namespace {
@@ -53,7 +52,7 @@ std::pair<Tensor, Tensor> childTruth(const std::vector<Coord>& coords, int level
   Tensor truth = torch::zeros({n, 8}, torch::kBool), known = torch::zeros({n, 8}, torch::kBool);
   bool* t = truth.data_ptr<bool>();
   bool* k = known.data_ptr<bool>();
-  openvdb::tree::ValueAccessor<const TokenMask> empty(o.space.empty);
+  openvdb::tree::ValueAccessor<const TokenMask> empty(o.seen->empty);
   const int side = 1 << (level - 1);
   for (const Coord& parent : coords)
     for (int slot = 0; slot < 8; ++slot, ++t, ++k) {
@@ -97,15 +96,11 @@ GaussianTensors decodeForTraining(EncoderNet& net, const Tensor& z, const Encode
 }
 
 Observation observeForTraining(const std::vector<View>& views, const EncoderConfig& c) {
-  ObservationSettings settings;
-  settings.patches_across = c.patches_across;
-  settings.level = c.levels;
-  VolumeSettings volume;
-  volume.voxel_m = c.voxel_m, volume.margin_m = .4f;
-  std::vector<DepthView> depth;
-  for (const View& v : views) depth.push_back(v.depthView());
+  ObserveSettings settings;
+  settings.patches_across = c.patches_across, settings.level = c.levels;
+  settings.volume.voxel_m = c.voxel_m, settings.volume.margin_m = .4f;
   Progress silent;
-  return observe(views, fitVolume(depth, volume, settings.carving), settings, silent);
+  return observe(views, settings, silent);
 }
 
 Losses sceneLosses(EncoderNet& net, const std::vector<View>& condition,

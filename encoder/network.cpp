@@ -216,10 +216,12 @@ Tensor srgbFromOpponent(const Tensor& o) {
 
 // Voxel features as the first layer sees them; octants without pixels stay 0.
 Tensor scaledFeatures(const Tensor& f) {
-  const Tensor octants = f.slice(1, 0, 32).view({-1, 8, 4}), share = octants.slice(2, 3, 4);
+  const Tensor octants = f.slice(1, kOctantColours, kMeanColour).view({-1, 8, 4}),
+               share = octants.slice(2, 3, 4);
   const Tensor colours = opponentColours(octants.slice(2, 0, 3)) * (share > 0);
   return torch::cat({torch::cat({colours, share * 4}, 2).view({-1, 32}),
-                     opponentColours(f.slice(1, 32, 35)), f.slice(1, 35, kVoxelFeatures) * 2},
+                     opponentColours(f.slice(1, kMeanColour, kPixelCount)),
+                     f.slice(1, kPixelCount, kVoxelFeatures) * 2},
                     1);
 }
 
@@ -227,7 +229,9 @@ Tensor scaledFeatures(const Tensor& f) {
 
 EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
   Tensor pooled = scaledFeatures(in.voxel_features);
-  Tensor octants = pooled.slice(1, 0, 32).view({-1, 8, 4}).slice(2, 0, 3);  // colours, [N, 8, 3]
+  Tensor octants = pooled.slice(1, kOctantColours, kMeanColour)
+                       .view({-1, 8, 4})
+                       .slice(2, 0, 3);  // colours, [N, 8, 3]
   Tensor x3 = voxel_in->forward(pooled);
   for (size_t l = 0; l < aggregate.size(); ++l) {
     const Tensor& children = in.children[l];
@@ -237,7 +241,7 @@ EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
           .view({children.size(0), 8, rows.size(1)});
     };
     const Tensor present = (children < x3.size(0)).sum(1, true).to(torch::kFloat32);
-    octants = gather(pooled.slice(1, 32, 35));
+    octants = gather(pooled.slice(1, kMeanColour, kPixelCount));
     pooled = gather(pooled).sum(1) / present;
     x3 = aggregate[l]->forward(gather(x3).flatten(1));
   }

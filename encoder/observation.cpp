@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace vdbc {
 namespace {
@@ -23,11 +24,10 @@ PatchLattice latticeOf(const View& view, int patches_across, int first) {
   return {patches_across, rows, first};
 }
 
-// Points of one view's usable pixels that lie in the bounds, in pixel order.
-std::vector<PixelPoint> pixelPoints(const View& view, const PatchLattice& lattice,
-                                    const Observation& o, const CarveSettings& carving) {
+// Points of the pixels of one view with a usable depth that lie in the bounds, in pixel order.
+std::vector<PixelPoint> pixelPoints(const View& view, const std::vector<float>& depth,
+                                    const PatchLattice& lattice, const Observation& o) {
   const Camera& c = view.camera;
-  const std::vector<float> depth = usableDepth(view.depthView(), carving);
   const Eigen::Isometry3d grid_from_camera =
       o.frame.world_from_grid.inverse() * c.world_from_camera;
   auto point = [&](int x, int y) {
@@ -85,24 +85,24 @@ void poolVoxelFeatures(const std::vector<std::vector<PixelPoint>>& points, Obser
       float* f = &o->voxel_features[size_t(p.voxel) * kVoxelFeatures];
       const Eigen::Vector3f place = p.index - p.index.array().floor().matrix();
       const int octant = (place.x() >= .5f) << 2 | (place.y() >= .5f) << 1 | int(place.z() >= .5f);
-      for (int c = 0; c < 3; ++c) f[4 * octant + c] += p.colour[c];
-      f[4 * octant + 3] += 1;
-      for (int c = 0; c < 3; ++c) f[32 + c] += p.colour[c];
-      for (int c = 0; c < 3; ++c) f[36 + c] += place[c] - .5f;
-      for (int c = 0; c < 3; ++c) f[39 + c] += p.normal[c];
+      for (int c = 0; c < 3; ++c) f[kOctantColours + 4 * octant + c] += p.colour[c];
+      f[kOctantColours + 4 * octant + 3] += 1;
+      for (int c = 0; c < 3; ++c) f[kMeanColour + c] += p.colour[c];
+      for (int c = 0; c < 3; ++c) f[kMeanPlace + c] += place[c] - .5f;
+      for (int c = 0; c < 3; ++c) f[kMeanNormal + c] += p.normal[c];
       pixels[size_t(p.voxel)] += 1;
     }
   for (size_t v = 0; v < n; ++v) {
     float* f = &o->voxel_features[v * kVoxelFeatures];
     const float total = std::max(1.f, pixels[v]);
     for (int octant = 0; octant < 8; ++octant) {
-      const float share = f[4 * octant + 3];
-      for (int c = 0; c < 3; ++c) f[4 * octant + c] /= std::max(1.f, share);
-      f[4 * octant + 3] = share / total;
+      const float share = f[kOctantColours + 4 * octant + 3];
+      for (int c = 0; c < 3; ++c) f[kOctantColours + 4 * octant + c] /= std::max(1.f, share);
+      f[kOctantColours + 4 * octant + 3] = share / total;
     }
-    for (int c = 0; c < 3; ++c) f[32 + c] /= total;
-    f[35] = std::log1p(pixels[v]) / 8;
-    for (int c = 36; c < 42; ++c) f[c] /= total;
+    for (int c = 0; c < 3; ++c) f[kMeanColour + c] /= total;
+    f[kPixelCount] = std::log1p(pixels[v]) / 8;
+    for (int c = kMeanPlace; c < kVoxelFeatures; ++c) f[c] /= total;
   }
 }
 
@@ -152,11 +152,20 @@ void meanPatchPoints(const std::vector<View>& views,
 
 }  // namespace
 
-Observation observe(const std::vector<View>& views, const VoxelFrame& frame,
-                    const ObservationSettings& settings, Progress& progress) {
-  std::vector<DepthView> depth_views;
-  for (const View& v : views) depth_views.push_back(v.depthView());
-  Observation o(frame, carve(frame, depth_views, settings.carving, progress));
+Observation observe(const std::vector<View>& views, const ObserveSettings& settings,
+                    Progress& progress) {
+  // Which depth is usable is decided once; what follows takes it as it is.
+  std::vector<std::vector<float>> depth(views.size());
+  std::vector<DepthView> usable(views.size());
+  tbb::parallel_for(size_t(0), views.size(), [&](size_t i) {
+    depth[i] = usableDepth(views[i].depthView(), settings.carving);
+    usable[i] = {views[i].camera, depth[i].data()};
+  });
+  constexpr CarveSettings kAsItIs{std::numeric_limits<float>::infinity(), 0};
+  Observation o;
+  o.frame = settings.frame ? *settings.frame : fitVolume(usable, settings.volume, kAsItIs);
+  o.seen = std::make_shared<const SeenSpace>(carve(o.frame, usable, kAsItIs, progress));
+  o.tokens = TokenGrid(o.seen->filled);
   require(o.tokens.size(0) > 0,
           "observe: the views: no valid depth falls into the volume (expected at least one pixel)");
   for (const View& v : views) {
@@ -165,7 +174,7 @@ Observation observe(const std::vector<View>& views, const VoxelFrame& frame,
   }
   std::vector<std::vector<PixelPoint>> points(views.size());
   tbb::parallel_for(size_t(0), views.size(), [&](size_t i) {
-    points[i] = pixelPoints(views[i], o.lattices[i], o, settings.carving);
+    points[i] = pixelPoints(views[i], depth[i], o.lattices[i], o);
   });
   report(progress, -1);
   poolVoxelFeatures(points, &o);

@@ -1,17 +1,24 @@
 #pragma once
 // Views to voxels: which voxels the pixels fill, what they look like, and which image patches see
 // which token. No torch, no network: the geometry that the encoder stands on. Spec E2-E5, E7.
+#include <memory>
+#include <optional>
 #include <vector>
 
 #include "splat/view.h"
 #include "vdb/carve.h"
+#include "vdb/fit_volume.h"
 #include "vdb/token_grid.h"
 
 namespace vdbc {
 
-/// What each voxel's pixels say, kVoxelFeatures floats:
-/// 8 octants x (mean sRGB colour 3, pixel share 1), mean colour 3, log(1 + pixels) / 8,
-/// mean place in the voxel 3 (0-1, less .5), mean normal 3 (grid axes).
+/// What a voxel's pixels say, kVoxelFeatures floats a voxel; where each part begins.
+constexpr int kOctantColours =
+    0;                           // 8 octants x (mean display sRGB 3, share of the voxel's pixels 1)
+constexpr int kMeanColour = 32;  // display sRGB, 3
+constexpr int kPixelCount = 35;  // log(1 + pixels) / 8
+constexpr int kMeanPlace = 36;   // in the voxel, 3 x 0-1, less .5
+constexpr int kMeanNormal = 39;  // grid axes, towards the camera, 3
 constexpr int kVoxelFeatures = 42;
 
 /// Patches of one view on a gw x gh lattice over its image.
@@ -20,14 +27,14 @@ struct PatchLattice {
   int first = 0;  // index of its first patch among those of all views
 };
 
+/// What views saw, in the grid's terms.
 struct Observation {
-  Observation(const VoxelFrame& f, const ObservedSpace& s) : frame(f), space(s), tokens(s.filled) {}
   VoxelFrame frame;
-  ObservedSpace space;                 // F, E of the views
-  TokenGrid tokens;                    // of F
-  std::vector<float> voxel_features;   // [N0, kVoxelFeatures]
-  std::vector<PatchLattice> lattices;  // one a view
-  int patches = 0;                     // of all views
+  std::shared_ptr<const SeenSpace> seen;  // F, E of the views
+  TokenGrid tokens;                       // of F
+  std::vector<float> voxel_features;      // [N0, kVoxelFeatures]
+  std::vector<PatchLattice> lattices;     // one a view
+  int patches = 0;                        // of all views
   /// Mean point of each patch's pixels in grid metres and its share of valid pixels, [patches, 4].
   std::vector<float> patch_points;
   /// Pixels of patch p whose point lies in token v of the latent level, as compressed sparse rows
@@ -37,15 +44,18 @@ struct Observation {
   std::vector<float> count;        // [nnz]
 };
 
-struct ObservationSettings {
+struct ObserveSettings {
+  VolumeSettings volume;            // of the grid that is fitted to the views
+  std::optional<VoxelFrame> frame;  // the grid, where it is given
   CarveSettings carving;
   int patches_across = 14;  // patches along the image's width; rows follow the aspect ratio
   int level = 1;            // tree level of the latents, whose tokens' pixels are counted
 };
 
-/// Throws Error if no pixel of any view falls into the frame's bounds.
-Observation observe(const std::vector<View>& views, const VoxelFrame& frame,
-                    const ObservationSettings& settings, Progress& progress);
+/// Fits the volume (or takes the given frame), carves it and pools pixels into voxels and patches.
+/// Throws Error if no pixel of any view falls into the frame's bounds, and as fitVolume() does.
+Observation observe(const std::vector<View>& views, const ObserveSettings& settings,
+                    Progress& progress);
 
 /// The pixels of `view` whose surface was observed, [H * W], 1 or 0: those with a usable depth
 /// whose point lies in one of the observation's tokens of `level`. What a reconstruction can be

@@ -11,10 +11,10 @@ int main(int argc, char** argv) try {
   const Encoder encoder(std::string(argv[2]) + "/encoder.safetensors");
   const Completer completer(std::string(argv[2]) + "/completer.safetensors");
   SceneSettings settings;
-  settings.volume.up = conventionalUp(argv[1]);
+  settings.observing.volume.up = conventionalUp(argv[1]);
   Progress silent;
-  const Completion place = completeScene(views, encoder, completer, settings, silent);
-  writeCompletion(views, place, encoder.hash(), argv[3], settings.volume.up, silent);
+  const Place place = completeScene(views, encoder, completer, settings, silent);
+  writePlace(place, views, encoder, settings, argv[3], silent);
 } catch (const std::exception& e) {
   std::fprintf(stderr, "%s\n", e.what());
   return 1;

@@ -19,11 +19,10 @@ void appendBytes(const std::vector<T>& values, std::string* bytes) {
   bytes->append(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T));
 }
 
-std::string hashOf(const LatentGrid& g) {
+std::string hashOf(const Place& place) {
   std::string bytes;
-  appendBytes(std::vector<Coord>{g.frame.bounds.min(), g.frame.bounds.max()}, &bytes);
-  appendBytes(g.ijk, &bytes), appendBytes(g.z, &bytes), appendBytes(g.observed, &bytes);
-  appendBytes(g.probability, &bytes), appendBytes(g.bfs_level, &bytes);
+  appendBytes(std::vector<Coord>{place.frame.bounds.min(), place.frame.bounds.max()}, &bytes);
+  forEachColumn([&](const auto& c) { appendBytes(c.values, &bytes); }, place);
   return hexOf(fnv1a(bytes.data(), bytes.size()));
 }
 
@@ -34,7 +33,7 @@ std::string hashOf(const TokenMask& mask) {
 }
 }  // namespace
 
-std::string completionIdentity(const Completer& completer, const LatentGrid& start,
+std::string completionIdentity(const Completer& completer, const Place& start,
                                const CompleteSettings& s) {
   return json{{"completer", completer.hash()},
               {"start", hashOf(start)},
@@ -52,27 +51,29 @@ std::string completionIdentity(const Completer& completer, const LatentGrid& sta
       .dump();
 }
 
-void writeCheckpoint(const LatentGrid& so_far, int32_t next_level, const ObservedSpace& space,
-                     const std::string& encoder_hash, const std::string& identity,
+void writeCheckpoint(const Place& so_far, int32_t next_level, const std::string& identity,
                      const std::string& path) {
   json growth = json::parse(identity);
   growth[kNextLevel] = next_level;
-  writeLatentVdb({so_far, space, encoder_hash, growth.dump()}, path);
+  Place place = so_far;
+  place.growth = growth.dump();
+  writeLatentVdb(place, path);
 }
 
-void readCheckpoint(const std::string& path, const std::string& encoder_hash,
-                    const std::string& identity, LatentGrid* start, CompleteSettings* settings) {
-  const LatentFile file = readLatentVdb(path);
-  json growth = json::parse(file.growth, nullptr, false);
+void readCheckpoint(const std::string& path, const std::string& identity, Place* start,
+                    CompleteSettings* settings) {
+  Place place = readLatentVdb(path);
+  json growth = json::parse(place.growth, nullptr, false);
   require(
       growth.is_object() && growth.contains(kNextLevel) && growth[kNextLevel].is_number_integer(),
       "--resume: ", path, ": expected a completion that was cut short, found another latent file");
   const int32_t next_level = growth[kNextLevel];
   growth.erase(kNextLevel);
-  require(growth.dump() == identity && file.encoder_hash == encoder_hash, "--resume: ", path,
-          ": is of another place, settings or weights (expected ", identity, ", found ",
-          growth.dump(), ")");
-  *start = file.latents;
+  require(growth.dump() == identity && place.encoder_hash == start->encoder_hash,
+          "--resume: ", path, ": is of another place, settings or weights (expected ", identity,
+          ", found ", growth.dump(), ")");
+  place.growth.clear();
+  *start = std::move(place);
   settings->first_level = next_level, settings->resumed = true;
 }
 

@@ -8,17 +8,16 @@ namespace vdbc {
 
 /// What has to be equal for one completion to go on where another stopped (JSON): the completer,
 /// what it starts from and all settings.
-std::string completionIdentity(const Completer& completer, const LatentGrid& start,
+std::string completionIdentity(const Completer& completer, const Place& start,
                                const CompleteSettings& settings);
 
-/// Writes tokens so far and the next level. Throws Error where the file cannot be written.
-void writeCheckpoint(const LatentGrid& so_far, int32_t next_level, const ObservedSpace& space,
-                     const std::string& encoder_hash, const std::string& identity,
+/// Writes the place so far and the next level. Throws Error where the file cannot be written.
+void writeCheckpoint(const Place& so_far, int32_t next_level, const std::string& identity,
                      const std::string& path);
 
-/// Tokens so far instead of `start`; sets `settings->first_level` and `resumed`. Throws Error
+/// The place so far instead of `start`; sets `settings->first_level` and `resumed`. Throws Error
 /// unless the file is there and of this identity and encoder.
-void readCheckpoint(const std::string& path, const std::string& encoder_hash,
-                    const std::string& identity, LatentGrid* start, CompleteSettings* settings);
+void readCheckpoint(const std::string& path, const std::string& identity, Place* start,
+                    CompleteSettings* settings);
 
 }  // namespace vdbc

@@ -13,57 +13,30 @@ namespace vdbc {
 
 namespace fs = std::filesystem;
 
-Observation observeScene(const std::vector<View>& views, const Encoder& encoder,
-                         const SceneSettings& settings, Progress& progress) {
-  VolumeSettings volume = settings.volume;
-  volume.voxel_m = encoder.config().voxel_m;
-  ObservationSettings observing = encoder.observationSettings();
-  observing.carving = settings.carving;
-  std::vector<DepthView> depth;
-  for (const View& v : views) depth.push_back(v.depthView());
-  return observe(views, fitVolume(depth, volume, settings.carving), observing, progress);
-}
-
-Encoding encodeScene(const std::vector<View>& views, const Encoder& encoder,
-                     const SceneSettings& settings, Progress& progress) {
+Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
+                  const SceneSettings& settings, Progress& progress) {
   progress.start("carve");
-  Encoding e{observeScene(views, encoder, settings, progress), {}};
+  const Observation observation = observe(views, encoder.observing(settings.observing), progress);
   progress.end();
   progress.start("encode");
-  e.latents = encoder.encode(views, e.observation, progress);
+  Place place = encoder.encode(views, observation, progress);
   progress.end();
-  return e;
+  return place;
 }
 
-Completion completeLatents(const LatentGrid& start, const ObservedSpace& space,
-                           const Encoder& encoder, const Completer& completer,
-                           const SceneSettings& settings, Progress& progress,
-                           const LevelListener& listener) {
-  Completion c{
-      space, keepTokens(start, [&](size_t i) { return start.observed[i] != 0; }), {}, {}, {}};
-  c.whole = completer.complete(start, space, settings.completion, progress, listener);
-  progress.start("decode");
-  c.seen_decoded = encoder.decode(c.seen, space, settings.child_threshold, progress);
-  c.whole_decoded = encoder.decode(c.whole, space, settings.child_threshold, progress);
-  progress.end();
-  return c;
+Place completeScene(const std::vector<View>& views, const Encoder& encoder,
+                    const Completer& completer, const SceneSettings& settings, Progress& progress) {
+  return completer.complete(encodeScene(views, encoder, settings, progress), settings.completion,
+                            progress);
 }
 
-Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
-                         const Completer& completer, const SceneSettings& settings,
-                         Progress& progress) {
-  const Encoding e = encodeScene(views, encoder, settings, progress);
-  return completeLatents(e.latents, e.observation.space, encoder, completer, settings, progress);
-}
-
-SceneVoxels sceneVoxels(const DecodedGrid& d, const LatentGrid& latents,
-                        const ObservedSpace& space) {
+SceneVoxels sceneVoxels(const DecodedGrid& d, const Place& place) {
   SceneVoxels v;
-  v.frame = latents.frame;
+  v.frame = place.frame;
   v.ijk = d.voxels;
-  v.empty.root() = space.empty.root();
+  v.empty.root() = place.seen->empty.root();
   const size_t n = d.voxels.size(), m = n ? size_t(d.gaussians.size()) / n : 0;
-  openvdb::tree::ValueAccessor<const TokenMask> filled(space.filled);
+  openvdb::tree::ValueAccessor<const TokenMask> filled(place.seen->filled);
   for (size_t i = 0; i < n; ++i) {
     Eigen::Vector3f colour = Eigen::Vector3f::Zero();
     float weight = 0, clear = 1;
@@ -82,8 +55,8 @@ SceneVoxels sceneVoxels(const DecodedGrid& d, const LatentGrid& latents,
     // A voxel was observed if a pixel's point lies in it; an observed token may gain unseen voxels.
     const bool observed = filled.isValueOn(d.voxels[i]);
     v.observed.push_back(observed);
-    v.probability.push_back(latents.probability[node]);
-    v.bfs_level.push_back(observed ? 0 : std::max(1, latents.bfs_level[node]));
+    v.probability.push_back(place.probability[node]);
+    v.bfs_level.push_back(observed ? 0 : std::max(1, place.bfs_level[node]));
   }
   return v;
 }
@@ -129,8 +102,8 @@ std::vector<Camera> novelCameras(const std::vector<View>& views, const Eigen::Ve
 
 }  // namespace
 
-Image contactSheet(const std::vector<View>& views, const Completion& completion,
-                   const Eigen::Vector3d& up) {
+Image contactSheet(const std::vector<View>& views, const Gaussians& observed,
+                   const Gaussians& completed, const Eigen::Vector3d& up) {
   const int columns = 4, shown = std::min(columns, int(views.size()));
   const int height =
       int(std::lround(double(kTileWidth) * views[0].camera.height / views[0].camera.width));
@@ -144,13 +117,11 @@ Image contactSheet(const std::vector<View>& views, const Completion& completion,
   }
   const std::vector<Camera> cameras = novelCameras(views, up, kTileWidth, height);
   RasterSettings settings;
-  settings.antialias = completion.whole_decoded.gaussians.antialias;
-  for (int i = 0; i < columns; ++i) {
-    pasteImage(rasterize(completion.seen_decoded.gaussians, cameras[size_t(i)], settings).colour,
-               i * kTileWidth, height, &sheet);
-    pasteImage(rasterize(completion.whole_decoded.gaussians, cameras[size_t(i)], settings).colour,
-               i * kTileWidth, 2 * height, &sheet);
-  }
+  settings.antialias = completed.antialias;
+  for (int row = 1; row < 3; ++row)
+    for (int i = 0; i < columns; ++i)
+      pasteImage(rasterize(row == 1 ? observed : completed, cameras[size_t(i)], settings).colour,
+                 i * kTileWidth, row * height, &sheet);
   return sheet;
 }
 
@@ -191,10 +162,9 @@ Writers sceneWriters(const SceneVoxels& voxels, const Gaussians& gaussians,
 }
 
 // A scene's files and `more`.
-void writeScene(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
-                const std::string& stem, const Eigen::Vector3d& up, const Writers& more,
-                Progress& progress) {
-  const SceneVoxels voxels = sceneVoxels(decoded, latents, space);
+void writeScene(const DecodedGrid& decoded, const Place& place, const std::string& stem,
+                const Eigen::Vector3d& up, const Writers& more, Progress& progress) {
+  const SceneVoxels voxels = sceneVoxels(decoded, place);
   const int64_t per_voxel =
       voxels.ijk.empty() ? 0 : decoded.gaussians.size() / int64_t(voxels.ijk.size());
   const Provenance provenance = gaussianProvenance(voxels, per_voxel);
@@ -236,21 +206,32 @@ std::string outputStem(const std::string& path, const std::vector<std::string>& 
   return stem;
 }
 
-void writeCompletion(const std::vector<View>& views, const Completion& c,
-                     const std::string& encoder_hash, const std::string& stem,
-                     const Eigen::Vector3d& up, Progress& progress) {
-  Writers more = {{kLatentEnding, [&](const std::string& path) {
-                     writeLatentVdb({c.whole, c.space, encoder_hash, ""}, path);
-                   }}};
+DecodedGrid writePlace(const Place& place, const std::vector<View>& views, const Encoder& encoder,
+                       const SceneSettings& settings, const std::string& stem, Progress& progress) {
+  const auto decode = [&](const Place& part) {
+    DecodedGrid decoded = encoder.decode(part, settings.child_threshold, progress);
+    decoded.gaussians.antialias = settings.antialias;
+    return decoded;
+  };
+  progress.start("decode");
+  const DecodedGrid decoded = decode(place);
+  progress.end();
+  Writers more = {{kLatentEnding, [&](const std::string& path) { writeLatentVdb(place, path); }}};
   if (!views.empty())
-    more.push_back({kPictureEnding,
-                    [&](const std::string& path) { writePng(contactSheet(views, c, up), path); }});
-  writeScene(c.whole_decoded, c.whole, c.space, stem, up, more, progress);
+    more.push_back(
+        {kPictureEnding, [&](const std::string& path) {
+           const Gaussians observed = decode(observedPart(place)).gaussians;
+           writePng(contactSheet(views, observed, decoded.gaussians, settings.observing.volume.up),
+                    path);
+         }});
+  const Eigen::Vector3d up = views.empty() ? upOf(place.frame) : settings.observing.volume.up;
+  writeScene(decoded, place, stem, up, more, progress);
+  return decoded;
 }
 
-void writeDecoded(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
-                  const std::string& stem, Progress& progress) {
-  writeScene(decoded, latents, space, stem, upOf(latents.frame), {}, progress);
+void writeDecoded(const DecodedGrid& decoded, const Place& place, const std::string& stem,
+                  Progress& progress) {
+  writeScene(decoded, place, stem, upOf(place.frame), {}, progress);
 }
 
 Rethresholded rethreshold(const std::string& from, float tau, const std::string& to,
@@ -263,28 +244,17 @@ Rethresholded rethreshold(const std::string& from, float tau, const std::string&
   require(origin.recorded, "rethreshold: ", points,
           ": expected Gaussians with `probability` and `completed`, found neither");
   progress.end();
-  SceneVoxels kept;
-  kept.frame = all.frame;
-  kept.empty.root() = all.empty.root();
-  for (size_t i = 0; i < all.ijk.size(); ++i) {
-    if (!all.observed[i] && !(all.probability[i] > tau)) continue;
-    kept.ijk.push_back(all.ijk[i]), kept.colour_linear.push_back(all.colour_linear[i]);
-    kept.density.push_back(all.density[i]), kept.observed.push_back(all.observed[i]);
-    kept.probability.push_back(all.probability[i]), kept.bfs_level.push_back(all.bfs_level[i]);
-  }
-  require(kept.ijk.size() < all.ijk.size(), "rethreshold: ", grids,
-          ": every generated voxel exceeds ", tau, " already (expected a tau that is larger)");
+  const SceneVoxels kept =
+      keepRows(all, [&](size_t i) { return all.observed[i] || all.probability[i] > tau; });
+  require(kept.size() < all.size(), "rethreshold: ", grids, ": every generated voxel exceeds ", tau,
+          " already (expected a tau that is larger)");
   std::vector<int64_t> rows;
-  Provenance provenance;
-  for (size_t i = 0; i < origin.generated.size(); ++i) {
-    if (origin.generated[i] && !(origin.probability[i] > tau)) continue;
-    rows.push_back(int64_t(i));
-    provenance.generated.push_back(origin.generated[i]),
-        provenance.probability.push_back(origin.probability[i]);
-  }
-  gaussians = selectGaussians(gaussians, rows);
-  writeTogether(sceneWriters(kept, gaussians, provenance, upOf(kept.frame)), to, progress);
-  return {int64_t(kept.ijk.size()), gaussians.size(), int64_t(all.ijk.size() - kept.ijk.size())};
+  for (int64_t i = 0; i < origin.size(); ++i)
+    if (!origin.generated[size_t(i)] || origin.probability[size_t(i)] > tau) rows.push_back(i);
+  const Gaussians chosen = selectRows(std::move(gaussians), rows);
+  writeTogether(sceneWriters(kept, chosen, selectRows(origin, rows), upOf(kept.frame)), to,
+                progress);
+  return {kept.size(), chosen.size(), all.size() - kept.size()};
 }
 
 }  // namespace vdbc

@@ -6,61 +6,36 @@
 
 #include "encoder/encoder.h"
 #include "mar/completer.h"
-#include "vdb/scene_volume.h"
+#include "vdb/scene_vdb.h"
 
 namespace vdbc {
 
 struct SceneSettings {
-  VolumeSettings volume;  // voxel size comes from the encoder's weights
-  CarveSettings carving;
+  ObserveSettings observing;  // voxel and patch sizes come from the encoder's weights
   CompleteSettings completion;
   float child_threshold = .05f;  // of BCE-up, for voxels that were not observed
+  bool antialias = false;        // decoded Gaussians are made for RasterSettings::antialias
 };
 
-/// What was observed, encoded.
-struct Encoding {
-  Observation observation;
-  LatentGrid latents;
-};
+/// The place as observed: fits the volume (voxels as the encoder's weights want them), carves,
+/// encodes.
+Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
+                  const SceneSettings& settings, Progress& progress);
 
-/// A completed place, before it is written.
-struct Completion {
-  ObservedSpace space;     // what the views saw filled and empty
-  LatentGrid seen, whole;  // latents of the observed tokens; the same and generated ones
-  DecodedGrid seen_decoded, whole_decoded;
-};
-
-/// Fits the volume (voxels as the encoder's weights want them), carves, pools pixels into voxels.
-Observation observeScene(const std::vector<View>& views, const Encoder& encoder,
-                         const SceneSettings& settings, Progress& progress);
-
-/// Carves and encodes.
-Encoding encodeScene(const std::vector<View>& views, const Encoder& encoder,
-                     const SceneSettings& settings, Progress& progress);
-
-/// Carves, encodes, completes, decodes. Observed tokens of `whole` are bit-identical to `seen`.
-Completion completeScene(const std::vector<View>& views, const Encoder& encoder,
-                         const Completer& completer, const SceneSettings& settings,
-                         Progress& progress);
-
-/// Completes and decodes what is encoded already: observed tokens, after them generated ones that
-/// stay (Completer::complete).
-Completion completeLatents(const LatentGrid& start, const ObservedSpace& space,
-                           const Encoder& encoder, const Completer& completer,
-                           const SceneSettings& settings, Progress& progress,
-                           const LevelListener& listener = nullptr);
+/// The completed place: encodes, completes. Observed tokens are those of encodeScene().
+Place completeScene(const std::vector<View>& views, const Encoder& encoder,
+                    const Completer& completer, const SceneSettings& settings, Progress& progress);
 
 /// Voxels with colour, density and provenance, from decoded content. A voxel's probability is its
 /// token's.
-SceneVoxels sceneVoxels(const DecodedGrid& decoded, const LatentGrid& latents,
-                        const ObservedSpace& space);
+SceneVoxels sceneVoxels(const DecodedGrid& decoded, const Place& place);
 /// Provenance of each Gaussian.
 Provenance gaussianProvenance(const SceneVoxels& voxels, int64_t gaussians_per_voxel);
 
 /// Picture: a row of input views, then for novel views (the mean camera place, four headings) a row
 /// as observed and a row as completed.
-Image contactSheet(const std::vector<View>& views, const Completion& completion,
-                   const Eigen::Vector3d& up);
+Image contactSheet(const std::vector<View>& views, const Gaussians& observed,
+                   const Gaussians& completed, const Eigen::Vector3d& up);
 
 /// Throws Error unless a file can be created at `path`; makes its folder. For before any long work.
 void requireCreatable(const std::string& path);
@@ -74,15 +49,15 @@ constexpr const char* kPictureEnding = ".png";
 /// of kSceneEndings and `more`; called before any long work.
 std::string outputStem(const std::string& vdb_path, const std::vector<std::string>& more);
 
-/// X.vdb, X.points.vdb, X.ply, X.latent.vdb (by the encoder of that hash) and X.png, which needs
-/// views. All are written to temporary names; a failure leaves none of this run's files behind.
-void writeCompletion(const std::vector<View>& views, const Completion& completion,
-                     const std::string& encoder_hash, const std::string& stem,
-                     const Eigen::Vector3d& up, Progress& progress);
+/// Decodes a completed place and writes X.vdb, X.points.vdb, X.ply, X.latent.vdb and, from views,
+/// X.png; returns what was decoded. All are written to temporary names; a failure leaves none of
+/// this run's files behind.
+DecodedGrid writePlace(const Place& place, const std::vector<View>& views, const Encoder& encoder,
+                       const SceneSettings& settings, const std::string& stem, Progress& progress);
 
-/// X.vdb, X.points.vdb and X.ply from decoded latents alone; up is the grid's z.
-void writeDecoded(const DecodedGrid& decoded, const LatentGrid& latents, const ObservedSpace& space,
-                  const std::string& stem, Progress& progress);
+/// X.vdb, X.points.vdb and X.ply from decoded content alone; up is the grid's z.
+void writeDecoded(const DecodedGrid& decoded, const Place& place, const std::string& stem,
+                  Progress& progress);
 
 struct Rethresholded {
   int64_t voxels = 0, gaussians = 0, dropped_voxels = 0;

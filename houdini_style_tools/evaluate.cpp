@@ -280,13 +280,13 @@ int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame,
   });
 }
 
-Reliability reliabilityOf(const LatentGrid& latents, const std::set<Coord>& truth) {
+Reliability reliabilityOf(const Place& place, const std::set<Coord>& truth) {
   Reliability bins;
-  for (size_t i = 0; i < latents.ijk.size(); ++i) {
-    if (latents.observed[i]) continue;
-    const double p = latents.probability[i];
+  for (size_t i = 0; i < place.ijk.size(); ++i) {
+    if (!place.generated[i]) continue;
+    const double p = place.probability[i];
     ReliabilityBin& bin = bins[std::min(bins.size() - 1, size_t(p * double(bins.size())))];
-    ++bin.count, bin.sum_probability += p, bin.hits += int64_t(truth.count(latents.ijk[i]));
+    ++bin.count, bin.sum_probability += p, bin.hits += int64_t(truth.count(place.ijk[i]));
   }
   return bins;
 }
@@ -385,15 +385,16 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
                                         const std::vector<double>& taus, const std::string& picture,
                                         Progress& progress, const UserNets& nets) {
   SceneSettings s = settings;
-  s.volume.up = scene.up;
+  s.observing.volume.up = scene.up;
 
   resetPeakMemory();
   auto start = std::chrono::steady_clock::now();
-  const Completion c = completeScene(scene.input, encoder, completer, s, progress);
+  const Place place = completeScene(scene.input, encoder, completer, s, progress);
+  const DecodedGrid completed = encoder.decode(place, s.child_threshold, progress);
   const double completed_seconds = secondsSince(start);
   const double completed_rss = peakMemoryMb();
-  const VoxelFrame& frame = c.seen.frame;
-  const NodeStates states = poolStates(frame, c.space, 1);
+  const VoxelFrame& frame = place.frame;
+  const NodeStates states = poolStates(frame, *place.seen, 1);
   const UnseenNodes unseen(scene, frame, states);
 
   std::vector<MethodResult> results;
@@ -412,21 +413,22 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
     resetPeakMemory();
   };
 
-  const MethodOutput observed{c.seen_decoded.gaussians, c.seen_decoded.voxels};
-  const SceneVoxels seen = sceneVoxels(c.seen_decoded, c.seen, c.space);
-
   // Observed-only without the completion, on its own clock.
   resetPeakMemory();
   start = std::chrono::steady_clock::now();
-  const Observation o = observeScene(scene.input, encoder, s, progress);
+  const Observation o = observe(scene.input, encoder.observing(s.observing), progress);
   const double observe_seconds = secondsSince(start);
-  encoder.decode(encoder.encode(scene.input, o, progress), o.space, s.child_threshold, progress);
+  const Place seen_place = encoder.encode(scene.input, o, progress);
+  const DecodedGrid decoded = encoder.decode(seen_place, s.child_threshold, progress);
   const double observed_seconds = secondsSince(start);
+  const MethodOutput observed{decoded.gaussians, decoded.voxels};
+  const SceneVoxels seen = sceneVoxels(decoded, seen_place);
   add("observed", observed, observed_seconds);
 
   start = std::chrono::steady_clock::now();
   std::vector<std::vector<uint8_t>> pixels;
-  for (const View& v : scene.input) pixels.push_back(observedPixels(v, o, c.seen.level, s.carving));
+  for (const View& v : scene.input)
+    pixels.push_back(observedPixels(v, o, place.level, s.observing.carving));
   const MethodOutput aligned{pixelAligned(scene.input, pixels), o.tokens.coords(0)};
   add("pixel-aligned", aligned, observe_seconds + secondsSince(start));
   columns.pop_back();
@@ -437,25 +439,25 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   start = std::chrono::steady_clock::now();
   const MethodOutput box = manhattanBox(observed, seen, states);
   add("box", box, observed_seconds + secondsSince(start));
-  add("completed", {c.whole_decoded.gaussians, c.whole_decoded.voxels}, completed_seconds);
+  add("completed", {completed.gaussians, completed.voxels}, completed_seconds);
   results.back().peak_rss_mb = completed_rss;
 
   if (scene.truth) {
-    results.back().reliability = reliabilityOf(c.whole, unseen.truth);
+    results.back().reliability = reliabilityOf(place, unseen.truth);
     results.back().ece = calibrationError(*results.back().reliability);
     start = std::chrono::steady_clock::now();
-    const LatentGrid oracle = completer.completeAt(
-        c.seen, c.space, surfaceNodes(*scene.truth, frame, 1), s.completion, progress);
-    const DecodedGrid d = encoder.decode(oracle, c.space, s.child_threshold, progress);
+    const Place oracle = completer.completeAt(seen_place, surfaceNodes(*scene.truth, frame, 1),
+                                              s.completion, progress);
+    const DecodedGrid d = encoder.decode(oracle, s.child_threshold, progress);
     add("oracle-occupancy", {d.gaussians, d.voxels}, observed_seconds + secondsSince(start));
   }
   if (!picture.empty()) writeColumns(columns, picture);
   for (double tau : taus) {
     s.completion.tau = float(tau);
     start = std::chrono::steady_clock::now();
-    const Completion other = completeLatents(c.seen, c.space, encoder, completer, s, progress);
-    add(joinText("completed-tau-", tau),
-        {other.whole_decoded.gaussians, other.whole_decoded.voxels},
+    const Place other = completer.complete(seen_place, s.completion, progress);
+    const DecodedGrid d = encoder.decode(other, s.child_threshold, progress);
+    add(joinText("completed-tau-", tau), {d.gaussians, d.voxels},
         observed_seconds + secondsSince(start));
   }
   return results;

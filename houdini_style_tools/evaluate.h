@@ -60,8 +60,8 @@ struct ReliabilityBin {
   double sum_probability = 0;
 };
 using Reliability = std::array<ReliabilityBin, 10>;
-/// Of the generated rows of `latents`; `truth` are nodes of their level.
-Reliability reliabilityOf(const LatentGrid& latents, const std::set<Coord>& truth);
+/// Of the generated tokens of `place`; `truth` are nodes of their level.
+Reliability reliabilityOf(const Place& place, const std::set<Coord>& truth);
 /// Expected calibration error: mean over the nodes of |share of hits - mean probability| of their
 /// bin (Naeini et al. 2015). NaN without nodes.
 double calibrationError(const Reliability& reliability);

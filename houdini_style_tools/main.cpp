@@ -121,12 +121,13 @@ std::string weightsFolder(const std::string& given) {
 
 SceneSettings sceneSettings(const Complete& o, const Common& common, const Eigen::Vector3d& up) {
   SceneSettings s;
-  s.volume.up = up;
-  s.volume.margin_m = float(o.margin);
+  s.observing.volume.up = up;
+  s.observing.volume.margin_m = float(o.margin);
   if (!o.bounds.empty()) {
-    s.volume.bounds = Eigen::AlignedBox3d(Eigen::Vector3d(o.bounds[0], o.bounds[1], o.bounds[2]),
-                                          Eigen::Vector3d(o.bounds[3], o.bounds[4], o.bounds[5]));
-    const Eigen::Vector3d sizes = s.volume.bounds->sizes();
+    s.observing.volume.bounds =
+        Eigen::AlignedBox3d(Eigen::Vector3d(o.bounds[0], o.bounds[1], o.bounds[2]),
+                            Eigen::Vector3d(o.bounds[3], o.bounds[4], o.bounds[5]));
+    const Eigen::Vector3d sizes = s.observing.volume.bounds->sizes();
     if (!sizes.allFinite() || sizes.minCoeff() <= 0)
       throw UsageError(
           "--bounds: expected a box: x0 y0 z0 x1 y1 z1 with each second corner larger");
@@ -137,6 +138,7 @@ SceneSettings sceneSettings(const Complete& o, const Common& common, const Eigen
   s.completion.sampling_steps = o.sampling_steps, s.completion.temperature = o.temperature;
   s.completion.generated_context = o.generated_context;
   s.completion.refine_observed = o.refine_observed;
+  s.antialias = o.antialias;
   s.completion.seed = common.seed;
   return s;
 }
@@ -208,15 +210,14 @@ bool endsWith(const std::string& text, const std::string& ending) {
 }
 
 // Latents that this encoder made, of a place that it could have seen.
-LatentFile readLatents(const std::string& path, const Encoder& encoder,
-                       const std::string& weights) {
+Place readLatents(const std::string& path, const Encoder& encoder, const std::string& weights) {
   constexpr int64_t kMaxVoxels = int64_t(1) << 30;
-  LatentFile file = readLatentVdb(path);
-  require(file.encoder_hash == encoder.hash(), path, ": expected the weights ", file.encoder_hash,
+  Place place = readLatentVdb(path);
+  require(place.encoder_hash == encoder.hash(), path, ": expected the weights ", place.encoder_hash,
           " that made it, found ", encoder.hash(), " in ", weights, " (use --weights)");
-  require(file.growth.empty(), path,
+  require(place.growth.empty(), path,
           ": is a completion that was cut short (expected a finished one; --resume goes on)");
-  const VoxelFrame& frame = file.latents.frame;
+  const VoxelFrame& frame = place.frame;
   const Coord size = frame.bounds.dim();
   bool whole = true;  // nodes of all levels
   for (int axis = 0; axis < 3; ++axis)
@@ -226,7 +227,7 @@ LatentFile readLatents(const std::string& path, const Encoder& encoder,
           path, ": expected voxels of ", encoder.config().voxel_m,
           " m and a volume of whole nodes and at most ", kMaxVoxels, " voxels, found ",
           frame.voxel_m, " m and ", frame.bounds);
-  return file;
+  return place;
 }
 
 // Results would lie over what they were made of.
@@ -262,26 +263,30 @@ std::string sampleStem(const std::string& stem, int n) {
 
 std::string checkpointOf(const std::string& stem) { return stem + ".checkpoint" + kLatentEnding; }
 
+// What a completion made.
+struct Made {
+  Place place;
+  DecodedGrid decoded;
+};
+
 // One completion from encoded tokens to files, checkpointed on the way.
-Completion cookSample(const SceneInput& in, LatentGrid start, const ObservedSpace& space,
-                      const Encoder& encoder, const Completer& completer, const std::string& stem,
-                      const Complete& o, Progress& progress) {
-  SceneSettings settings = in.settings;
+Made cookSample(const SceneInput& in, Place start, const Encoder& encoder,
+                const Completer& completer, const std::string& stem, const Complete& o,
+                Progress& progress) {
+  CompleteSettings settings = in.settings.completion;
   const std::string checkpoint = checkpointOf(stem);
-  const std::string identity = completionIdentity(completer, start, settings.completion);
-  if (o.resume && fs::exists(checkpoint))
-    readCheckpoint(checkpoint, encoder.hash(), identity, &start, &settings.completion);
-  Completion c = naming(o.views, [&] {
-    return completeLatents(start, space, encoder, completer, settings, progress,
-                           [&](const LatentGrid& so_far, int32_t next_level) {
-                             writeCheckpoint(so_far, next_level, space, encoder.hash(), identity,
-                                             checkpoint);
-                           });
+  const std::string identity = completionIdentity(completer, start, settings);
+  if (o.resume && fs::exists(checkpoint)) readCheckpoint(checkpoint, identity, &start, &settings);
+  return naming(o.views, [&] {
+    Made made;
+    made.place =
+        completer.complete(start, settings, progress, [&](const Place& so_far, int32_t next_level) {
+          writeCheckpoint(so_far, next_level, identity, checkpoint);
+        });
+    made.decoded = writePlace(made.place, in.views, encoder, in.settings, stem, progress);
+    fs::remove(checkpoint);
+    return made;
   });
-  for (DecodedGrid* d : {&c.seen_decoded, &c.whole_decoded}) d->gaussians.antialias = o.antialias;
-  writeCompletion(in.views, c, encoder.hash(), stem, in.up, progress);
-  fs::remove(checkpoint);
-  return c;
 }
 
 // The output's stem, once all names can be written and what is to be resumed is there.
@@ -311,30 +316,27 @@ void cookComplete(const Complete& o, const Common& common, Progress& progress) {
   const Encoder encoder(weights + "/encoder.safetensors");
   const Completer completer(weights + "/completer.safetensors");
   SceneInput in;
-  const LatentFile encoded = [&]() -> LatentFile {
+  const Place all = [&] {
     if (from_latents) {
-      LatentFile file = readLatents(o.views, encoder, weights);
+      Place place = readLatents(o.views, encoder, weights);
       in = {{},
-            file.latents.frame.world_from_grid.linear().col(2),
+            place.frame.world_from_grid.linear().col(2),
             sceneSettings(o, common, Eigen::Vector3d::UnitZ())};
       progress.end();
-      return file;
+      return place;
     }
     in = readScene(o, common, chosen);
     progress.end();
-    const Encoding e =
-        naming(o.views, [&] { return encodeScene(in.views, encoder, in.settings, progress); });
-    return {e.latents, e.observation.space, encoder.hash(), ""};
+    return naming(o.views, [&] { return encodeScene(in.views, encoder, in.settings, progress); });
   }();
-  const LatentGrid& all = encoded.latents;
   require(o.from_level == 1 ||
               std::count(all.bfs_level.begin(), all.bfs_level.end(), o.from_level - 1) > 0,
           "--from-level: ", o.views, ": expected tokens of growth level ", o.from_level - 1,
           ", found none");
   TokenMask locked;
   if (!o.lock.empty()) locked.topologyUnion(readTokenMask(o.lock, all.frame, 1));
-  const LatentGrid start = keepTokens(all, [&](size_t i) {
-    return all.observed[i] || all.bfs_level[i] < o.from_level || locked.isValueOn(all.ijk[i]);
+  const Place start = keepRows(all, [&](size_t i) {
+    return !all.generated[i] || all.bfs_level[i] < o.from_level || locked.isValueOn(all.ijk[i]);
   });
   in.settings.completion.first_level = o.from_level;
   in.settings.completion.region = allowedTokens(o, all.frame, locked);
@@ -342,15 +344,16 @@ void cookComplete(const Complete& o, const Common& common, Progress& progress) {
   std::vector<std::vector<Coord>> samples;
   ordered_json made;
   for (int n = 1; n <= o.samples; ++n) {
-    const Completion c =
-        cookSample(in, start, encoded.seen, encoder, completer, sampleStem(stem, n), o, progress);
+    const Made sample = cookSample(in, start, encoder, completer, sampleStem(stem, n), o, progress);
+    const auto& generated = sample.place.generated;
+    const auto observed = std::count(generated.begin(), generated.end(), uint8_t(0));
     if (n == 1)
       made = {{"views", in.views.size()},
-              {"observed_tokens", c.seen.size()},
-              {"generated_tokens", c.whole.size() - c.seen.size()},
-              {"voxels", c.whole_decoded.voxels.size()},
-              {"gaussians", c.whole_decoded.gaussians.size()}};
-    samples.push_back(c.whole_decoded.voxels);
+              {"observed_tokens", observed},
+              {"generated_tokens", sample.place.size() - observed},
+              {"voxels", sample.decoded.voxels.size()},
+              {"gaussians", sample.decoded.gaussians.size()}};
+    samples.push_back(sample.decoded.voxels);
     ++in.settings.completion.seed;
   }
   if (o.samples > 1) writeOccupancyVdb(all.frame, samples, stem + kOccupancyEnding);
@@ -402,18 +405,18 @@ void cookEncode(const Complete& o, const Common& common, Progress& progress) {
   const SceneInput in = readScene(o, common, chosen);
   const Encoder encoder(weights + "/encoder.safetensors");
   progress.end();
-  const Encoding e =
+  const Place place =
       naming(o.views, [&] { return encodeScene(in.views, encoder, in.settings, progress); });
   progress.start("write");
-  writeLatentVdb({e.latents, e.observation.space, encoder.hash(), ""}, o.output);
+  writeLatentVdb(place, o.output);
   progress.end();
   const double seconds = secondsSince(start);
   printSummary(common.json,
                {{"views", in.views.size()},
-                {"tokens", e.latents.size()},
+                {"tokens", place.size()},
                 {"seconds", seconds},
                 {"output", o.output}},
-               joinText(in.views.size(), " views: ", e.latents.size(), " tokens; ",
+               joinText(in.views.size(), " views: ", place.size(), " tokens; ",
                         std::round(seconds * 10) / 10, " s\n", o.output),
                scaleJson(o));
 }
@@ -424,24 +427,22 @@ void cookDecode(const Decode& o, const Common& common, Progress& progress) {
   const auto start = std::chrono::steady_clock::now();
   progress.start("read");
   const Encoder encoder(weights);
-  const LatentFile file =
-      naming("decode", [&] { return readLatents(o.latents, encoder, weights); });
+  const Place place = naming("decode", [&] { return readLatents(o.latents, encoder, weights); });
   progress.end();
   progress.start("decode");
-  DecodedGrid decoded = naming(o.latents, [&] {
-    return encoder.decode(file.latents, file.seen, float(o.child_tau), progress);
-  });
+  DecodedGrid decoded =
+      naming(o.latents, [&] { return encoder.decode(place, float(o.child_tau), progress); });
   decoded.gaussians.antialias = o.antialias;
   progress.end();
-  writeDecoded(decoded, file.latents, file.seen, stem, progress);
+  writeDecoded(decoded, place, stem, progress);
   const double seconds = secondsSince(start);
   printSummary(common.json,
-               {{"tokens", file.latents.size()},
+               {{"tokens", place.size()},
                 {"voxels", decoded.voxels.size()},
                 {"gaussians", decoded.gaussians.size()},
                 {"seconds", seconds},
                 {"output", stem}},
-               joinText(file.latents.size(), " tokens: ", decoded.voxels.size(), " voxels, ",
+               joinText(place.size(), " tokens: ", decoded.voxels.size(), " voxels, ",
                         decoded.gaussians.size(), " Gaussians; ", std::round(seconds * 10) / 10,
                         " s\n", stem, ".vdb  ", stem, ".points.vdb  ", stem, ".ply"));
 }

@@ -112,7 +112,7 @@ Gaussians voxelMean(const Observation& o, int per_voxel) {
   for (int64_t v = 0; v < o.tokens.size(0); ++v) {
     const Coord ijk = o.tokens.coords(0)[size_t(v)];
     const float* features = &o.voxel_features[size_t(v) * kVoxelFeatures];
-    const Eigen::Vector3f srgb(features[32], features[33], features[34]);
+    const Eigen::Vector3f srgb = Eigen::Map<const Eigen::Vector3f>(features + kMeanColour);
     for (int i = 0; i < per_voxel; ++i)
       addIsotropic(
           o.frame.toWorld(Eigen::Vector3d(ijk.x(), ijk.y(), ijk.z()) + place.col(i).cast<double>()),
@@ -171,7 +171,7 @@ Gaussians optimised(const Gaussians& start, const std::vector<View>& views,
 
 SetScores splitScores(const TriangleMesh& truth, const Observation& o,
                       const std::vector<Coord>& voxels, int level) {
-  openvdb::tree::ValueAccessor<const TokenMask> empty(o.space.empty);
+  openvdb::tree::ValueAccessor<const TokenMask> empty(o.seen->empty);
   const int side = 1 << level;
   const auto unseen = [&](const Coord& child) {
     if (o.tokens.row(level + 1, tokenCoord(child, 1)) < 0 || o.tokens.row(level, child) >= 0)
@@ -192,25 +192,25 @@ std::vector<ReconstructionResult> evaluateReconstruction(
     const EvaluationScene& scene, const Encoder& encoder, const SceneSettings& settings,
     double optimise_seconds, const std::string& picture, Progress& progress) {
   SceneSettings s = settings;
-  s.volume.up = scene.up;
+  s.observing.volume.up = scene.up;
   const int level = encoder.config().levels;
 
   resetPeakMemory();
   progress.start("encode");
   auto start = Clock::now();
-  const Observation o = observeScene(scene.input, encoder, s, progress);
+  const Observation o = observe(scene.input, encoder.observing(s.observing), progress);
   const double observe_seconds = secondsSince(start);
-  const LatentGrid latents = encoder.encode(scene.input, o, progress);
+  const Place place = encoder.encode(scene.input, o, progress);
   const double encode_seconds = secondsSince(start);
   progress.end();
   progress.start("decode");
   start = Clock::now();
-  const DecodedGrid decoded = encoder.decode(latents, o.space, s.child_threshold, progress);
+  const DecodedGrid decoded = encoder.decode(place, s.child_threshold, progress);
   const double decode_seconds = secondsSince(start);
   progress.end();
 
-  const JudgedViews input = judged(scene.input, o, level, s.carving);
-  const JudgedViews others = judged(fewOf(scene.targets), o, level, s.carving);
+  const JudgedViews input = judged(scene.input, o, level, s.observing.carving);
+  const JudgedViews others = judged(fewOf(scene.targets), o, level, s.observing.carving);
   std::vector<ReconstructionResult> results;
   std::vector<std::vector<Image>> columns(1);
   for (const JudgedViews* j : {&input, &others})

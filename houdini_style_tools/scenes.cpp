@@ -3,8 +3,6 @@
 #include <algorithm>
 #include <filesystem>
 
-#include "vdb/scene_volume.h"
-
 namespace vdbc {
 
 namespace fs = std::filesystem;
@@ -37,16 +35,6 @@ std::vector<View> trainingViews(uint64_t seed, const std::string& cache_folder) 
   return views;
 }
 
-VoxelFrame completionFrame(const std::vector<View>& views, const EncoderConfig& config,
-                           const Eigen::Vector3d& up) {
-  VolumeSettings volume;
-  volume.voxel_m = config.voxel_m;
-  volume.up = up;
-  std::vector<DepthView> depth;
-  for (const View& v : views) depth.push_back(v.depthView());
-  return fitVolume(depth, volume, CarveSettings());
-}
-
 CompletionSample completionSample(const Encoder& encoder, uint64_t seed, int choice,
                                   const std::string& cache_folder,
                                   const std::string& sample_folder) {
@@ -60,17 +48,19 @@ CompletionSample completionSample(const Encoder& encoder, uint64_t seed, int cho
   static constexpr size_t kCounts[] = {1, 2, 2, 2, 2, 3, 4, 6};
   const size_t n = kCounts[(seed + 3 * uint64_t(choice)) % 8];
   const std::vector<View> few(views.begin(), views.begin() + std::ptrdiff_t(n));
-  const VoxelFrame frame = completionFrame(few, encoder.config(), Eigen::Vector3d::UnitZ());
   Progress silent;
-  const Observation sparse = observe(few, frame, encoder.observationSettings(), silent);
-  const Observation dense = observe(views, frame, encoder.observationSettings(), silent);
+  ObserveSettings settings = encoder.observing();
+  settings.volume.up = Eigen::Vector3d::UnitZ();
+  const Observation sparse = observe(few, settings, silent);
+  settings.frame = sparse.frame;
+  const Observation dense = observe(views, settings, silent);
   CompletionSample s;
   s.condition = encoder.encode(few, sparse, silent);
   s.target = encoder.encode(views, dense, silent);
-  s.seen_nodes = poolStates(frame, sparse.space, 1),
-  s.seen_coarse = poolStates(frame, sparse.space, 2);
-  s.target_nodes = poolStates(frame, dense.space, 1),
-  s.target_coarse = poolStates(frame, dense.space, 2);
+  s.seen_nodes = poolStates(sparse.frame, *sparse.seen, 1),
+  s.seen_coarse = poolStates(sparse.frame, *sparse.seen, 2);
+  s.target_nodes = poolStates(sparse.frame, *dense.seen, 1),
+  s.target_coarse = poolStates(sparse.frame, *dense.seen, 2);
   fs::create_directories(sample_folder);
   writeSample(s, path);
   return s;

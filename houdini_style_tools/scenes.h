@@ -30,10 +30,6 @@ const AssetLibrary& roomAssets();
 /// and put there where they are missing. No folder: rendered.
 std::vector<View> trainingViews(uint64_t seed, const std::string& cache_folder);
 
-/// Volume of a scene to complete: what the main job uses, so that training sees the same.
-VoxelFrame completionFrame(const std::vector<View>& views, const EncoderConfig& config,
-                           const Eigen::Vector3d& up);
-
 /// How many samples of the completer's training a room gives.
 constexpr int kSamplesPerRoom = 2;
 

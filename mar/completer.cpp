@@ -102,23 +102,6 @@ struct Completer::Impl {
   std::shared_ptr<CompleterNet> net;
   std::string hash, trained_on;
 
-  // Tokens with predicted latents as files hold them, one tensor [., D] or more.
-  struct Tokens {
-    std::vector<Coord> ijk;
-    std::vector<float> probability;
-    std::vector<int32_t> level;
-    std::vector<Tensor> z;
-
-    void add(const Tokens& from, const std::vector<int64_t>& rows) {
-      for (int64_t row : rows) {
-        ijk.push_back(from.ijk[size_t(row)]);
-        probability.push_back(from.probability[size_t(row)]);
-        level.push_back(from.level[size_t(row)]);
-      }
-      z.push_back(torch::cat(from.z).index_select(0, torch::tensor(rows, torch::kInt64)));
-    }
-  };
-
   // Standardised predictions as a file will hold them: a run that goes on from one sees the same
   // numbers.
   Tensor asFiled(const Tensor& z, bool project) const {
@@ -128,44 +111,43 @@ struct Completer::Impl {
         .contiguous();
   }
 
-  // The growing grid, observed rows first; `z` [N, D] has its latents standardised.
+  // The growing place, observed rows first; `z` [N, D] has its latents standardised.
   struct Growth {
-    LatentGrid grid;
+    Place place;
     Tensor z;
     std::vector<Coord> observed;
 
     int64_t seeds() const { return int64_t(observed.size()); }
 
-    void append(const Tokens& t, CompleterNet& net) {
-      const Tensor latents = torch::cat(t.z).contiguous();
-      z = torch::cat({z, net.standardise(latents)});
-      grid.ijk.insert(grid.ijk.end(), t.ijk.begin(), t.ijk.end());
-      grid.z.insert(grid.z.end(), latents.data_ptr<float>(),
-                    latents.data_ptr<float>() + latents.numel());
-      grid.observed.resize(grid.ijk.size(), 0);
-      grid.probability.insert(grid.probability.end(), t.probability.begin(), t.probability.end());
-      grid.bfs_level.insert(grid.bfs_level.end(), t.level.begin(), t.level.end());
+    void append(const Place& more, CompleterNet& net) {
+      z = torch::cat({z, net.standardise(torch::tensor(more.z).view({more.size(), more.dim}))});
+      appendRows(&place, more);
     }
   };
 
-  Growth begin(const LatentGrid& start, const CompleteSettings& s, Tokens* dropped) const {
+  // No tokens, of the same latents.
+  Place noTokens() const {
+    Place none;
+    none.dim = net->config.latent_dim;
+    return none;
+  }
+
+  Growth begin(const Place& start, const CompleteSettings& s, Place* dropped) const {
     const int d = net->config.latent_dim;
-    require(start.level == 1 && start.dim == d, "Completer: the latent grid: expected ", d,
+    require(start.level == 1 && start.dim == d, "Completer: the place: expected latents of ", d,
             " channels at level 1, found ", start.dim, " at level ", start.level);
-    const auto seeds = std::count(start.observed.begin(), start.observed.end(), 1);
+    const auto seeds = std::count(start.generated.begin(), start.generated.end(), uint8_t(0));
     const std::vector<Coord> observed(start.ijk.begin(), start.ijk.begin() + seeds);
-    require(seeds > 0, "Completer: the latent grid is empty (expected observed tokens)");
-    require(std::is_sorted(start.observed.rbegin(), start.observed.rend()),
-            "Completer: the latent grid: expected observed tokens before generated ones");
-    const Tensor z = torch::tensor(start.z).view({start.size(), d});
+    require(seeds > 0, "Completer: the place is empty (expected observed tokens)");
+    require(std::is_sorted(start.generated.begin(), start.generated.end()),
+            "Completer: the place: expected observed tokens before generated ones");
     auto stays = [&](size_t i) {
-      return !s.resumed || start.observed[i] || start.probability[i] > s.tau;
+      return !s.resumed || !start.generated[i] || start.probability[i] > s.tau;
     };
-    std::vector<int64_t> rows[2];
-    for (int64_t i = 0; i < start.size(); ++i) rows[stays(size_t(i))].push_back(i);
-    dropped->add({start.ijk, start.probability, start.bfs_level, {z}}, rows[0]);
-    return {keepTokens(start, stays), net->standardise(z.index_select(0, torch::tensor(rows[1]))),
-            observed};
+    *dropped = keepRows(start, [&](size_t i) { return !stays(i); });
+    Growth g{keepRows(start, stays), {}, observed};
+    g.z = net->standardise(torch::tensor(g.place.z).view({g.place.size(), d}));
+    return g;
   }
 
   // A part of the volume that the networks look at as one: what it decides, and the frame with its
@@ -225,8 +207,9 @@ struct Completer::Impl {
     return parts;
   }
 
-  static Scene sceneOf(const LatentGrid& start, const ObservedSpace& space) {
-    return {sceneTokens(poolStates(start.frame, space, 1), poolStates(start.frame, space, 2)),
+  static Scene sceneOf(const Place& start) {
+    return {sceneTokens(poolStates(start.frame, *start.seen, 1),
+                        poolStates(start.frame, *start.seen, 2)),
             windowsOf(start.frame),
             {}};
   }
@@ -245,12 +228,12 @@ struct Completer::Impl {
   }
 
   // One chunk: targets that lie close together, with what is nearest to them as context.
-  Tokens predict(const Growth& g, const Scene& scene, const std::vector<Coord>& targets,
-                 int32_t level, const CompleteSettings& s, torch::Generator& random) const {
+  Place predict(const Growth& g, const Scene& scene, const std::vector<Coord>& targets,
+                int32_t level, const CompleteSettings& s, torch::Generator& random) const {
     const Eigen::Vector3d centre = centreOf(targets);
     std::array<TokenSet, kTokenKinds> in;
     std::vector<int64_t> rows[2];
-    const std::vector<Coord>& context = s.generated_context ? g.grid.ijk : g.observed;
+    const std::vector<Coord>& context = s.generated_context ? g.place.ijk : g.observed;
     for (int64_t row : nearestRows(
              context, centre, s.context_tokens ? s.context_tokens : net->config.context_tokens)) {
       const int kind = row >= g.seeds();
@@ -270,21 +253,26 @@ struct Completer::Impl {
     const CompleterNet::Fine f =
         net->fine(in, scene.windows[scene.windowOf(in[kTarget].coords[0])].frame);
     const Tensor p = f.logits.sigmoid().contiguous();
-    return {targets,
-            {p.data_ptr<float>(), p.data_ptr<float>() + p.numel()},
-            std::vector<int32_t>(targets.size(), level),
-            {asFiled(net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random),
-                     s.generated_context)}};
+    const Tensor z =
+        asFiled(net->diffusion->sample(f.targets, s.sampling_steps, s.temperature, random),
+                s.generated_context);
+    Place made = noTokens();
+    made.ijk = targets;
+    made.z.assign(z.data_ptr<float>(), z.data_ptr<float>() + z.numel());
+    made.probability.assign(p.data_ptr<float>(), p.data_ptr<float>() + p.numel());
+    made.bfs_level.assign(targets.size(), level);
+    made.generated.assign(targets.size(), 1);
+    return made;
   }
 
   // Visits candidates level by level; keeps those that `keep` accepts given their probability, the
   // others are added to `dropped`. Levels are distances from what was observed, whatever of them is
   // done already or may not be generated.
   template <typename Keep>
-  void grow(Growth* g, Tokens* dropped, const Scene& scene, const std::vector<Coord>& candidates,
+  void grow(Growth* g, Place* dropped, const Scene& scene, const std::vector<Coord>& candidates,
             const CompleteSettings& s, Keep keep, Progress& progress,
             const LevelListener& listener) const {
-    const std::set<Coord> done(g->grid.ijk.begin() + g->seeds(), g->grid.ijk.end());
+    const std::set<Coord> done(g->place.ijk.begin() + g->seeds(), g->place.ijk.end());
     std::vector<int32_t> levels = breadthFirstLevels(candidates, g->observed, s.neighbours);
     if (s.random_order) std::shuffle(levels.begin(), levels.end(), std::mt19937_64(s.seed));
     const int32_t last = levels.empty() ? 0 : *std::max_element(levels.begin(), levels.end());
@@ -298,51 +286,47 @@ struct Completer::Impl {
         if (levels[i] == level && !done.count(candidates[i]) &&
             (!s.region || s.region->isValueOn(candidates[i])))
           frontier.push_back(candidates[i]);
-      Tokens kept;
+      Place kept = noTokens();
       for (const std::vector<Coord>& part : byWindow(scene, frontier))
         for (const std::vector<Coord>& targets :
              chunksOf(part, s.chunk_tokens ? s.chunk_tokens : net->config.chunk_tokens)) {
           report(progress, -1);
-          const Tokens p = predict(*g, scene, targets, level, s, random);
-          std::vector<int64_t> rows[2];
-          for (size_t i = 0; i < targets.size(); ++i)
-            rows[keep(p.probability[i])].push_back(int64_t(i));
-          dropped->add(p, rows[0]), kept.add(p, rows[1]);
+          const Place made = predict(*g, scene, targets, level, s, random);
+          const auto isKept = [&](size_t i) { return keep(made.probability[i]); };
+          appendRows(dropped, keepRows(made, [&](size_t i) { return !isKept(i); }));
+          appendRows(&kept, keepRows(made, isKept));
         }
-      if (kept.z.empty()) continue;
+      if (frontier.empty()) continue;
       // Only now: every chunk of a level saw the same context.
       g->append(kept, *net);
       if (!listener) continue;
       if (s.hole_tau < s.tau) {  // closing holes asks for what was dropped
         Growth all = *g;
         all.append(*dropped, *net);
-        listener(all.grid, level + 1);
+        listener(all.place, level + 1);
       } else {
-        listener(g->grid, level + 1);
+        listener(g->place, level + 1);
       }
     }
   }
 
   // Takes dropped tokens back where they close a hole.
-  void closeHoles(Growth* g, const Scene& scene, const Tokens& dropped, float least) const {
+  void closeHoles(Growth* g, const Scene& scene, const Place& dropped, float least) const {
     std::map<Coord, float> probability;
     std::map<Coord, int64_t> row;
     for (size_t i = 0; i < dropped.ijk.size(); ++i)
       probability[dropped.ijk[i]] = dropped.probability[i], row[dropped.ijk[i]] = int64_t(i);
     std::vector<int64_t> rows;
-    for (const Coord& c : closingTokens(scene.tokens.nodes, g->grid.ijk, probability, least))
+    for (const Coord& c : closingTokens(scene.tokens.nodes, g->place.ijk, probability, least))
       rows.push_back(row.at(c));
-    if (rows.empty()) return;
-    Tokens closing;
-    closing.add(dropped, rows);
-    g->append(closing, *net);
+    g->append(selectRows(dropped, rows), *net);
   }
 
   // Condition latents rewritten from everything that was decoded (spec A8), chunk by chunk.
   void refine(Growth* g, const Scene& scene, const CompleteSettings& s) const {
     torch::Generator random = at::detail::createCPUGenerator(s.seed + 1);
     const int64_t seeds = g->seeds();
-    const std::vector<Coord> generated(g->grid.ijk.begin() + seeds, g->grid.ijk.end());
+    const std::vector<Coord> generated(g->place.ijk.begin() + seeds, g->place.ijk.end());
     std::map<Coord, int64_t> row_of;
     for (int64_t i = 0; i < seeds; ++i) row_of[g->observed[size_t(i)]] = i;
     Tensor refined = g->z.slice(0, 0, seeds).clone();
@@ -368,7 +352,7 @@ struct Completer::Impl {
                                                                  s.temperature, random)));
       }
     const Tensor z = net->restore(refined).to(torch::kHalf).to(torch::kFloat32).contiguous();
-    std::copy_n(z.data_ptr<float>(), z.numel(), g->grid.z.begin());
+    std::copy_n(z.data_ptr<float>(), z.numel(), g->place.z.begin());
   }
 };
 
@@ -391,14 +375,13 @@ const CompleterConfig& Completer::config() const { return impl_->net->config; }
 std::string Completer::hash() const { return impl_->hash; }
 std::string Completer::trainedOn() const { return impl_->trained_on; }
 
-LatentGrid Completer::complete(const LatentGrid& start, const ObservedSpace& space,
-                               const CompleteSettings& s, Progress& progress,
-                               const LevelListener& listener) const {
+Place Completer::complete(const Place& start, const CompleteSettings& s, Progress& progress,
+                          const LevelListener& listener) const {
   torch::NoGradGuard no_grad;
   progress.start("complete");
-  Impl::Tokens dropped;
+  Place dropped;
   Impl::Growth g = impl_->begin(start, s, &dropped);
-  Impl::Scene scene = Impl::sceneOf(start, space);
+  Impl::Scene scene = Impl::sceneOf(start);
   impl_->openGate(&scene);
   std::vector<Coord> open;
   for (const auto& [node, probability] : scene.gate)
@@ -409,17 +392,16 @@ LatentGrid Completer::complete(const LatentGrid& start, const ObservedSpace& spa
   if (s.hole_tau < s.tau) impl_->closeHoles(&g, scene, dropped, s.hole_tau);
   if (s.refine_observed) impl_->refine(&g, scene, s);
   progress.end();
-  return std::move(g.grid);
+  return std::move(g.place);
 }
 
-LatentGrid Completer::completeAt(const LatentGrid& seen, const ObservedSpace& space,
-                                 const std::vector<Coord>& occupied, const CompleteSettings& s,
-                                 Progress& progress) const {
+Place Completer::completeAt(const Place& start, const std::vector<Coord>& occupied,
+                            const CompleteSettings& s, Progress& progress) const {
   torch::NoGradGuard no_grad;
   progress.start("complete");
-  Impl::Tokens dropped;
-  Impl::Growth g = impl_->begin(seen, s, &dropped);
-  Impl::Scene scene = Impl::sceneOf(seen, space);
+  Place dropped;
+  Impl::Growth g = impl_->begin(start, s, &dropped);
+  Impl::Scene scene = Impl::sceneOf(start);
   std::vector<Coord> candidates;
   for (const Coord& c : std::set<Coord>(occupied.begin(), occupied.end())) {
     if (scene.tokens.nodes.at(c) != NodeState::kUnobserved) continue;
@@ -429,7 +411,7 @@ LatentGrid Completer::completeAt(const LatentGrid& seen, const ObservedSpace& sp
   impl_->grow(
       &g, &dropped, scene, candidates, s, [](float) { return true; }, progress, nullptr);
   progress.end();
-  return std::move(g.grid);
+  return std::move(g.place);
 }
 
 }  // namespace vdbc

@@ -6,7 +6,7 @@
 #include <string>
 
 #include "vdb/frontier.h"
-#include "vdb/latent_grid.h"
+#include "vdb/place.h"
 
 namespace vdbc {
 
@@ -65,7 +65,7 @@ struct CompleteSettings {
 /// Called after each growth level with all tokens so far (dropped ones too, if holes are to be
 /// closed) and the level that comes next. Completing those tokens from that level on, `resumed`,
 /// gives, bit by bit, what the uninterrupted run gives.
-using LevelListener = std::function<void(const LatentGrid& so_far, int32_t next_level)>;
+using LevelListener = std::function<void(const Place& so_far, int32_t next_level)>;
 
 /// Trained networks, loaded once.
 class Completer {
@@ -80,21 +80,18 @@ class Completer {
   /// The scenes it was trained on, as the file says (`rooms:SEED-SEED`).
   std::string trainedOn() const;
 
-  /// `start` plus generated tokens: coarse gate, then growth level by level (A10-A13). `start` has
-  /// observed tokens first; generated ones after them stay as they are and are not visited
-  /// again. Its rows come first, bit-identical unless refine_observed; generated latents are
-  /// rounded to half precision, so that files hold them exactly. `space` says what was seen empty;
-  /// tokens that are F or E in it are never visited. Places beyond 12.8 m are looked at in
-  /// overlapping windows, by the coarse stage and by the position code; windows without anything
-  /// filled stay as they are. Same seed and threads, same grid.
-  LatentGrid complete(const LatentGrid& start, const ObservedSpace& space,
-                      const CompleteSettings& settings, Progress& progress,
-                      const LevelListener& listener = nullptr) const;
+  /// `start` plus generated tokens: coarse gate, then growth level by level. `start` has observed
+  /// tokens first; generated ones after them stay as they are and are not visited again. Its rows
+  /// come first, bit-identical unless refine_observed; generated latents are rounded to half
+  /// precision, so that files hold them exactly. Tokens that are F or E in `start.seen` are never
+  /// visited. Places beyond 12.8 m are looked at in overlapping windows, by the coarse stage and by
+  /// the position code; windows without anything filled stay as they are. Same seed, same place.
+  Place complete(const Place& start, const CompleteSettings& settings, Progress& progress,
+                 const LevelListener& listener = nullptr) const;
 
-  /// The same with given occupancy: latents for `occupied` tokens (spec: oracle).
-  LatentGrid completeAt(const LatentGrid& seen, const ObservedSpace& space,
-                        const std::vector<Coord>& occupied, const CompleteSettings& settings,
-                        Progress& progress) const;
+  /// The same with given occupancy: latents for `occupied` tokens (an oracle).
+  Place completeAt(const Place& start, const std::vector<Coord>& occupied,
+                   const CompleteSettings& settings, Progress& progress) const;
 
  private:
   struct Impl;

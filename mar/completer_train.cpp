@@ -330,17 +330,15 @@ Tensor colourWayOf(const std::vector<float>& rows, const Tensor& latents, const 
 
 // Roll-outs on validation samples: precision, recall, F1 on the nodes that were unobserved.
 std::map<std::string, double> validate(const std::string& weights,
-                                       const std::vector<CompletionSample>& samples,
-                                       const std::vector<ObservedSpace>& spaces) {
+                                       const std::vector<CompletionSample>& samples) {
   const Completer completer(weights);
   // Fixed, so that logs compare whatever the program's defaults are.
   CompleteSettings settings;
   settings.tau = .5f, settings.coarse_tau = .1f, settings.hole_tau = 1;
   Progress silent;
   double precision = 0, recall = 0, f1 = 0, error = 0;
-  for (size_t i = 0; i < samples.size(); ++i) {
-    const CompletionSample& s = samples[i];
-    const LatentGrid whole = completer.complete(s.condition, spaces[i], settings, silent);
+  for (const CompletionSample& s : samples) {
+    const Place whole = completer.complete(s.condition, settings, silent);
     double hit = 0, filled = 0, truth = 0, known = 0, squared = 0, matched = 0;
     for (auto node = s.seen_nodes.box.begin(); node; ++node)
       truth += s.seen_nodes.at(*node) == NodeState::kUnobserved &&
@@ -367,13 +365,13 @@ std::map<std::string, double> validate(const std::string& weights,
           {"val_latent_mse", error / n}};
 }
 
-// The observed space of a sample at node resolution, for roll-outs without its views.
-ObservedSpace nodeSpace(const CompletionSample& s) {
-  ObservedSpace space;
+// What the condition views saw, at node resolution, for roll-outs without the views.
+std::shared_ptr<const SeenSpace> nodeSpace(const CompletionSample& s) {
+  const auto space = std::make_shared<SeenSpace>();
   for (auto node = s.seen_nodes.box.begin(); node; ++node) {
     const NodeState state = s.seen_nodes.at(*node);
     if (state == NodeState::kUnobserved) continue;
-    TokenMask& mask = state == NodeState::kFilled ? space.filled : space.empty;
+    TokenMask& mask = state == NodeState::kFilled ? space->filled : space->empty;
     for (int slot = 0; slot < 8; ++slot) mask.setValueOn(childCoord(*node, slot));
   }
   return space;
@@ -402,10 +400,9 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
   Trainer trainer(net, average, "completer", config.toJson(), settings, listener);
   const Tensor colours = colourWayOf(colour_way, latents, *net);
   std::vector<CompletionSample> held_out;
-  std::vector<ObservedSpace> spaces;
   for (int i = 0; i < validation_count; ++i) {
     held_out.push_back(validation(uint64_t(i)));
-    spaces.push_back(nodeSpace(held_out.back()));
+    held_out.back().condition.seen = nodeSpace(held_out.back());
   }
   // A fresh order of all samples every epoch, known from the sample's number alone.
   auto load = [&](int64_t first) {
@@ -442,7 +439,7 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
     trainer.update();
     if (trainer.validationDue()) {
       trainer.saveWeights();
-      trainer.log(validate(settings.weights_path, held_out, spaces));
+      trainer.log(validate(settings.weights_path, held_out));
     }
     trainer.saveIfDue();
     trainer.stopIfInterrupted(progress);
@@ -515,8 +512,7 @@ NodeStates statesOf(const Tensor& t, const std::string& path) {
 void writeSample(const CompletionSample& s, const std::string& path) {
   TensorFile file;
   for (const auto& [name, grid] :
-       {std::pair<const char*, const LatentGrid*>{"condition", &s.condition},
-        {"target", &s.target}}) {
+       {std::pair<const char*, const Place*>{"condition", &s.condition}, {"target", &s.target}}) {
     file.tensors[joinText(name, ".ijk")] = coordTensor(grid->ijk);
     file.tensors[joinText(name, ".z")] = torch::tensor(grid->z).view({grid->size(), grid->dim});
   }
@@ -548,7 +544,7 @@ CompletionSample readSample(const std::string& path) {
   const Tensor bounds = get("bounds", torch::kInt32), voxel = get("voxel_m", torch::kFloat32);
   require(bounds.numel() == 6 && voxel.numel() == 1, "readSample: ", path, ": bad frame");
   for (const auto& [name, grid] :
-       {std::pair<const char*, LatentGrid*>{"condition", &s.condition}, {"target", &s.target}}) {
+       {std::pair<const char*, Place*>{"condition", &s.condition}, {"target", &s.target}}) {
     const Tensor ijk = get(joinText(name, ".ijk"), torch::kInt32),
                  z = get(joinText(name, ".z"), torch::kFloat32);
     require(ijk.dim() == 2 && ijk.size(1) == 3 && z.dim() == 2 && z.size(0) == ijk.size(0),
@@ -558,7 +554,7 @@ CompletionSample readSample(const std::string& path) {
       grid->ijk.emplace_back(p[3 * i], p[3 * i + 1], p[3 * i + 2]);
     grid->dim = int(z.size(1));
     grid->z.assign(z.data_ptr<float>(), z.data_ptr<float>() + z.numel());
-    grid->observed.assign(grid->ijk.size(), 1);
+    grid->generated.assign(grid->ijk.size(), 0);
     grid->probability.assign(grid->ijk.size(), 1.f);
     grid->bfs_level.assign(grid->ijk.size(), 0);
     const int32_t* b = bounds.data_ptr<int32_t>();

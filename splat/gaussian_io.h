@@ -25,6 +25,13 @@ struct Provenance {
   std::vector<uint8_t> generated;  // [N] 0 or 1
   std::vector<float> probability;  // [N] 0-1
   bool recorded = false;           // read from the file, which has both or one of them
+
+  int64_t size() const { return int64_t(generated.size()); }
+
+  template <typename Self>
+  static auto columns(Self& p) {
+    return std::make_tuple(column("generated", p.generated), column("probability", p.probability));
+  }
 };
 
 /// One points grid `splats`: P fixed point 16 bit, scale vec3s (half, if all sigmas are within its

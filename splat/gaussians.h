@@ -4,6 +4,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "vdb/columns.h"
+
 namespace vdbc {
 
 constexpr float kSh0 = 0.28209479177387814f;  // colour (display sRGB) = 0.5 + kSh0 * sh[0]
@@ -21,15 +23,16 @@ struct Gaussians {
   int64_t size() const { return int64_t(mean.size()); }
   int shCoefficients() const { return (sh_degree + 1) * (sh_degree + 1); }
   void resize(int64_t n, int degree);
+
+  template <typename Self>
+  static auto columns(Self& g) {
+    return std::make_tuple(column("mean", g.mean), column("log_scale", g.log_scale),
+                           column("rotation", g.rotation), column("opacity_logit", g.opacity_logit),
+                           column("sh", g.sh, size_t(g.shCoefficients()) * 3));
+  }
 };
 
-/// Throws Error unless all arrays have matching lengths.
+/// Throws Error unless all arrays have matching lengths and the SH degree is 0-3.
 void requireConsistent(const Gaussians& gaussians);
-
-/// Those Gaussians of `from`, in that order.
-Gaussians selectGaussians(const Gaussians& from, const std::vector<int64_t>& rows);
-
-/// Appends `more` (same SH degree, else Error).
-void append(Gaussians* gaussians, const Gaussians& more);
 
 }  // namespace vdbc

@@ -17,7 +17,7 @@
 #include <set>
 
 #include "splat/view_reading.h"
-#include "vdb/scene_volume.h"
+#include "vdb/fit_volume.h"
 #include "vdb/vdb_file.h"
 
 namespace vdbc {

@@ -84,7 +84,7 @@ void run(benchmark::State& state, float voxel_m, const Carve& carve_views) {
   const tbb::global_control one(tbb::global_control::max_allowed_parallelism, 1);
   double filled = 0, empty = 0;
   for (auto _ : state) {
-    const ObservedSpace space = carve_views(frame, views, settings);
+    const SeenSpace space = carve_views(frame, views, settings);
     filled = double(space.filled.activeVoxelCount());
     empty = double(space.empty.activeVoxelCount());
   }
@@ -93,8 +93,8 @@ void run(benchmark::State& state, float voxel_m, const Carve& carve_views) {
   state.counters["E"] = empty;
 }
 
-ObservedSpace voxelDriven(const VoxelFrame& frame, const std::vector<DepthView>& views,
-                          const CarveSettings& settings) {
+SeenSpace voxelDriven(const VoxelFrame& frame, const std::vector<DepthView>& views,
+                      const CarveSettings& settings) {
   Progress progress;
   return carve(frame, views, settings, progress);
 }

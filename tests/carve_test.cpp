@@ -88,8 +88,8 @@ std::set<Coord> voxelSet(const TokenMask& mask) {
 void expectSameAsTraversal(const VoxelFrame& frame, const std::vector<OwnedView>& views,
                            const CarveSettings& settings, const std::string& what) {
   Progress progress;
-  const ObservedSpace fast = carve(frame, borrow(views), settings, progress);
-  const ObservedSpace truth = carveByTraversal(frame, borrow(views), settings);
+  const SeenSpace fast = carve(frame, borrow(views), settings, progress);
+  const SeenSpace truth = carveByTraversal(frame, borrow(views), settings);
   EXPECT_TRUE(sameVoxels(fast.filled, truth.filled)) << what;
   EXPECT_TRUE(sameVoxels(fast.empty, truth.empty))
       << what << ": " << fast.empty.activeVoxelCount() << " of " << truth.empty.activeVoxelCount()
@@ -182,7 +182,7 @@ TEST(Carve, TraversalMatchesClosedForm) {
     settings.flying_pixel_ratio = 0;
     const VoxelFrame frame = roomFrame(0.23f + 0.05f * round, 0.3 * round);
     const ClosedForm truth = closedForm(frame, views, settings);
-    const ObservedSpace space = carveByTraversal(frame, borrow(views), settings);
+    const SeenSpace space = carveByTraversal(frame, borrow(views), settings);
     EXPECT_EQ(voxelSet(space.filled), truth.filled);
     std::set<Coord> empty = voxelSet(space.empty), expected = truth.empty;
     for (const Coord& c : truth.unsure) empty.erase(c), expected.erase(c);
@@ -227,7 +227,7 @@ TEST(Carve, EveryKindOfBadDepth) {
   std::vector<OwnedView> views = roomViews(8, 6, 5);
   for (OwnedView& v : views) v.depth.assign(v.depth.size(), 0.f);
   Progress progress;
-  const ObservedSpace none = carve(roomFrame(0.1f), borrow(views), {}, progress);
+  const SeenSpace none = carve(roomFrame(0.1f), borrow(views), {}, progress);
   EXPECT_EQ(none.filled.activeVoxelCount() + none.empty.activeVoxelCount(), 0u);
 }
 
@@ -302,7 +302,7 @@ TEST(Carve, RandomScenes) {
 TEST(Carve, PartitionsTheVolume) {
   const VoxelFrame frame = roomFrame(0.1f, 0.3);
   Progress progress;
-  const ObservedSpace space = carve(frame, borrow(roomViews(80, 60, 50)), {}, progress);
+  const SeenSpace space = carve(frame, borrow(roomViews(80, 60, 50)), {}, progress);
   const std::set<Coord> filled = voxelSet(space.filled), empty = voxelSet(space.empty);
   EXPECT_GT(filled.size(), 500u);
   EXPECT_GT(empty.size(), 5000u);
@@ -314,8 +314,7 @@ TEST(Carve, PartitionsTheVolume) {
 
 TEST(Carve, EmptyIsPrunedToTiles) {
   Progress progress;
-  const ObservedSpace space =
-      carve(roomFrame(0.05f), borrow(roomViews(160, 120, 100)), {}, progress);
+  const SeenSpace space = carve(roomFrame(0.05f), borrow(roomViews(160, 120, 100)), {}, progress);
   EXPECT_GT(space.empty.activeTileCount(), 1000u);
   for (auto leaf = space.empty.cbeginLeaf(); leaf; ++leaf) {
     EXPECT_FALSE(leaf->isDense() || leaf->isEmpty());
@@ -349,7 +348,7 @@ TEST(Carve, VolumeFractionsMatchClosedForm) {
   Progress progress;
   CarveSettings settings;
   settings.flying_pixel_ratio = 0;
-  const ObservedSpace space = carve(frame, borrow(views), settings, progress);
+  const SeenSpace space = carve(frame, borrow(views), settings, progress);
   const double voxel = std::pow(0.04, 3), stretch = half / (plate_x - 2);
   const double shadow = 4 * stretch * stretch * (std::pow(2, 3) - std::pow(plate_x - 2, 3)) / 3;
   const double volume = double(frame.bounds.volume()) * voxel;
@@ -378,7 +377,7 @@ TEST(Carve, ThreadCountDoesNotMatter) {
     Progress progress;
     return carve(frame, borrow(views), {}, progress);
   };
-  const ObservedSpace one = run(1), four = run(4);
+  const SeenSpace one = run(1), four = run(4);
   EXPECT_TRUE(one.filled.hasSameTopology(four.filled));
   EXPECT_TRUE(one.empty.hasSameTopology(four.empty));
 }
@@ -472,7 +471,7 @@ TEST(PoolStates, EqualsBruteForce) {
   for (const Coord& shift : {Coord(0, 0, 0), Coord(1, 3, -2)}) {
     frame.bounds.translate(shift);  // nodes at the border are cut at other places
     Progress progress;
-    const ObservedSpace space = carve(frame, borrow(roomViews(120, 90, 60)), {}, progress);
+    const SeenSpace space = carve(frame, borrow(roomViews(120, 90, 60)), {}, progress);
     for (int level = 0; level <= 4; ++level) {
       const NodeStates pooled = poolStates(frame, space, level);
       EXPECT_EQ(pooled.box, CoordBBox(tokenCoord(frame.bounds.min(), level),

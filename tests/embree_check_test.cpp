@@ -413,7 +413,7 @@ TEST(Carve, VolumesAgreeWithEmbreeOnBoxes) {
     CarveSettings settings;
     settings.flying_pixel_ratio = 0;  // every ray counts, as in the truth
     Progress progress;
-    const ObservedSpace space = carve(frame, depth_views, settings, progress);
+    const SeenSpace space = carve(frame, depth_views, settings, progress);
     const double total = double(frame.bounds.volume());
     const double f = double(space.filled.activeVoxelCount()) / total;
     const double e = double(space.empty.activeVoxelCount()) / total, u = 1 - f - e;

@@ -20,8 +20,8 @@
 #include "encoder/weights.h"
 #include "splat/rasterize_torch.h"
 #include "tests/simple_room.h"
+#include "vdb/fit_volume.h"
 #include "vdb/frontier.h"
-#include "vdb/scene_volume.h"
 
 namespace vdbc {
 namespace {
@@ -707,9 +707,9 @@ TEST_F(EncoderFile, DecodesNoTokensToNoGaussians) {
   const Encoder encoder = encoderOf(toyConfig());
   LatentGrid nothing;
   nothing.dim = 16;
-  EXPECT_EQ(encoder.decode(nothing, ObservedSpace(), .5f, silent_).gaussians.size(), 0);
+  EXPECT_EQ(encoder.decode(nothing, SeenSpace(), .5f, silent_).gaussians.size(), 0);
   nothing.dim = 8;
-  EXPECT_THROW(encoder.decode(nothing, ObservedSpace(), .5f, silent_), Error);
+  EXPECT_THROW(encoder.decode(nothing, SeenSpace(), .5f, silent_), Error);
 }
 
 TEST_F(EncoderFile, BadFilesThrow) {

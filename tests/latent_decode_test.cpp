@@ -9,8 +9,8 @@
 #include "encoder/encoder.h"
 #include "tests/files.h"
 #include "tests/simple_room.h"
+#include "vdb/fit_volume.h"
 #include "vdb/latent_vdb.h"
-#include "vdb/scene_volume.h"
 
 namespace vdbc {
 namespace {

@@ -91,8 +91,8 @@ CompletionSample toySample(int seen_x = 5) {
   return s;
 }
 
-ObservedSpace spaceOf(const NodeStates& nodes) {
-  ObservedSpace space;
+SeenSpace spaceOf(const NodeStates& nodes) {
+  SeenSpace space;
   for (auto c = nodes.box.begin(); c; ++c)
     for (int slot = 0; slot < 8; ++slot) {
       if (nodes.at(*c) == NodeState::kFilled) space.filled.setValueOn(childCoord(*c, slot));
@@ -1022,7 +1022,7 @@ TEST_F(CompleterFile, KeptTokensConditionTheNextLevel) {  // A11
 
 TEST_F(CompleterFile, GoesOnFromAnyLevelAsIfItHadNeverStopped) {
   const Completer completer = completerOf(toyConfig());
-  const ObservedSpace space = spaceOf(sample_.seen_nodes);
+  const SeenSpace space = spaceOf(sample_.seen_nodes);
   for (const bool generated_context : {false, true}) {
     CompleteSettings settings;
     settings.tau = .5f, settings.hole_tau = .1f, settings.sampling_steps = 3;
@@ -1116,7 +1116,7 @@ TEST_F(CompleterFile, PlacesBeyondOneWindowAreVisitedOnceEverywhere) {
   LatentGrid seen;
   seen.dim = kDim;
   seen.frame.bounds = CoordBBox(Coord(0), Coord(303, 15, 7));
-  ObservedSpace space;
+  SeenSpace space;
   for (int x0 : {0, 70})
     for (auto c = CoordBBox(Coord(x0, 0, 1), Coord(x0 + 3, 3, 1)).begin(); c; ++c) {
       seen.ijk.push_back(*c);
@@ -1169,7 +1169,7 @@ TEST_F(CompleterFile, RefinementRewritesObservedLatentsAlone) {  // A8
 
 TEST_F(CompleterFile, RefusesWhatItCannotComplete) {
   const Completer completer = completerOf(toyConfig());
-  const ObservedSpace space = spaceOf(sample_.seen_nodes);
+  const SeenSpace space = spaceOf(sample_.seen_nodes);
   LatentGrid grid = sample_.condition;
   grid.level = 2;
   EXPECT_THROW(completer.complete(grid, space, {}, silent_), Error);

@@ -10,7 +10,7 @@
 #include <set>
 
 #include "tests/simple_room.h"
-#include "vdb/scene_volume.h"
+#include "vdb/fit_volume.h"
 
 namespace vdbc {
 namespace {

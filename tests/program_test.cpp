@@ -26,7 +26,7 @@
 #include "tests/simple_room.h"
 #include "vdb/error.h"
 #include "vdb/latent_vdb.h"
-#include "vdb/scene_volume.h"
+#include "vdb/scene_vdb.h"
 
 #ifndef VDBC_WEIGHTS
 #define VDBC_WEIGHTS VDBC_SOURCE_DIR "/weights/small"
@@ -497,7 +497,7 @@ TEST_F(Program, ObservedVoxelsAreTheCarvedViews) {
   const VoxelFrame frame = fitVolume(depth, volume, {});
   EXPECT_EQ(written.frame.bounds, frame.bounds);
   EXPECT_TRUE(written.frame.world_from_grid.isApprox(frame.world_from_grid, 1e-6));
-  const ObservedSpace space = carveByTraversal(frame, depth, {});
+  const SeenSpace space = carveByTraversal(frame, depth, {});
   std::set<Coord> expected, found;
   for (auto v = space.filled.cbeginValueOn(); v; ++v) expected.insert(v.getCoord());
   for (size_t i = 0; i < written.ijk.size(); ++i)
@@ -952,7 +952,7 @@ TEST_F(Program, CheckFindsCarvedVoxelsInAgreement) {
   all.flying_pixel_ratio = 0;
   SceneVoxels v;
   v.frame = fitVolume(depth, {}, all);
-  const ObservedSpace space = carveByTraversal(v.frame, depth, all);
+  const SeenSpace space = carveByTraversal(v.frame, depth, all);
   for (auto voxel = space.filled.cbeginValueOn(); voxel; ++voxel) {
     v.ijk.push_back(voxel.getCoord());
     v.colour_linear.emplace_back(.5f, .5f, .5f);

@@ -185,7 +185,7 @@ TEST(RoomTruth, ObservationNeverContradictsIt) {
   std::vector<DepthView> depth;
   for (const View& v : views) depth.push_back(v.depthView());
   Progress silent;
-  const ObservedSpace seen = carve(truth.frame, depth, CarveSettings(), silent);
+  const SeenSpace seen = carve(truth.frame, depth, CarveSettings(), silent);
   int64_t filled = 0, apart = 0;
   for (auto c = truth.frame.bounds.begin(); c; ++c) {
     if (seen.empty.isValueOn(*c)) {

@@ -17,8 +17,8 @@
 #include "splat/embree_check.h"
 #include "splat/view.h"
 #include "tests/vdb_files.h"
+#include "vdb/fit_volume.h"
 #include "vdb/grid_instances.h"
-#include "vdb/scene_volume.h"
 
 namespace vdbc {
 namespace {

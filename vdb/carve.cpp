@@ -707,9 +707,9 @@ std::vector<float> usableDepth(const DepthView& view, const CarveSettings& setti
   return usable;
 }
 
-ObservedSpace carve(const VoxelFrame& frame, const std::vector<DepthView>& views,
-                    const CarveSettings& settings, Progress& progress) {
-  ObservedSpace space;
+SeenSpace carve(const VoxelFrame& frame, const std::vector<DepthView>& views,
+                const CarveSettings& settings, Progress& progress) {
+  SeenSpace space;
   if (frame.bounds.empty() || views.empty()) return space;
   report(progress, 0);
 
@@ -764,8 +764,8 @@ ObservedSpace carve(const VoxelFrame& frame, const std::vector<DepthView>& views
   return space;
 }
 
-ObservedSpace carveByTraversal(const VoxelFrame& frame, const std::vector<DepthView>& views,
-                               const CarveSettings& settings) {
+SeenSpace carveByTraversal(const VoxelFrame& frame, const std::vector<DepthView>& views,
+                           const CarveSettings& settings) {
   MaskTree filled, empty;
   openvdb::tree::ValueAccessor<MaskTree> filled_voxels(filled), empty_voxels(empty);
   for (size_t n = 0; n < views.size(); ++n) {
@@ -784,14 +784,14 @@ ObservedSpace carveByTraversal(const VoxelFrame& frame, const std::vector<DepthV
     }
   }
   empty.topologyDifference(filled);
-  ObservedSpace space;
+  SeenSpace space;
   space.filled.root() = tokenMask({&filled}).root();
   space.empty.root() = tokenMask({&empty}).root();
   openvdb::tools::prune(space.empty);
   return space;
 }
 
-NodeStates poolStates(const VoxelFrame& frame, const ObservedSpace& space, int level) {
+NodeStates poolStates(const VoxelFrame& frame, const SeenSpace& space, int level) {
   require(level >= 0 && level < 16, "poolStates: expected a level of 0-15, found ", level);
   NodeStates pooled;
   pooled.level = level;

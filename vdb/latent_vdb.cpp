@@ -8,7 +8,6 @@
 #include <cmath>
 
 #include "vdb/point_leaves.h"
-#include "vdb/scene_volume.h"
 #include "vdb/vdb_file.h"
 
 namespace vdbc {
@@ -20,14 +19,11 @@ constexpr uint64_t kMaxBytes = uint64_t(1) << 34;
 constexpr int kMaxDim = 1024;                     // as the encoder's configuration
 constexpr int64_t kMaxValues = int64_t(1) << 30;  // of all latents: 4 GiB
 
-// Names of the grids, their attributes and metadata: the format, shared by writer and reader.
+// Names of the grids, of attributes beside Place::columns(), and of metadata: the format, shared by
+// writer and reader.
 constexpr const char* kLatent = "latent";
 constexpr const char* kFilled = "filled";
 constexpr const char* kEmpty = "empty";
-constexpr const char* kZ = "z";
-constexpr const char* kProbability = "probability";
-constexpr const char* kBfsLevel = "bfs_level";
-constexpr const char* kGenerated = "generated";
 constexpr const char* kRow = "row";
 constexpr const char* kLevel = "latent_level";
 constexpr const char* kDim = "latent_dim";
@@ -35,8 +31,22 @@ constexpr const char* kHash = "encoder_hash";
 constexpr const char* kGrowth = "growth";
 constexpr const char* kFrame = "world_from_grid";
 
+// Calls visit(column, value type, codec) for each column that is an attribute: all but the
+// coordinates, which are where the points lie. Flags are bool in files.
+template <typename PlaceType, typename Visit>
+void forEachAttribute(PlaceType& place, const Visit& visit) {
+  forEachColumn(
+      [&](auto c) {
+        using Value = typename decltype(c)::Value;
+        if constexpr (!std::is_same_v<Value, Coord>)
+          visit(c, std::conditional_t<std::is_same_v<Value, uint8_t>, bool, Value>(),
+                std::conditional_t<decltype(c)::is_half, HalfCodec, ExactCodec>());
+      },
+      place);
+}
+
 /// Throws unless every token makes sense; for writer and reader.
-void requireTokens(const char* operation, const LatentGrid& g, const std::string& path) {
+void requireTokens(const char* operation, const Place& g, const std::string& path) {
   const CoordBBox nodes(tokenCoord(g.frame.bounds.min(), g.level),
                         tokenCoord(g.frame.bounds.max(), g.level));
   for (size_t i = 0; i < g.ijk.size(); ++i) {
@@ -49,47 +59,41 @@ void requireTokens(const char* operation, const LatentGrid& g, const std::string
   }
 }
 
-void requireWritable(const LatentFile& file, const std::string& path) {
-  const LatentGrid& g = file.latents;
-  const size_t n = g.ijk.size();
+void requireWritable(const Place& g, const std::string& path) {
   require(g.level >= 0 && g.level < kTokenLevels && g.dim > 0 && g.dim <= kMaxDim &&
               std::isfinite(g.frame.voxel_m) && g.frame.voxel_m > 0,
           kWrite, ": ", path, ": expected level 0-2, dim 1-", kMaxDim,
           " and a voxel size, found level ", g.level, ", dim ", g.dim, ", ", g.frame.voxel_m, " m");
-  require(g.z.size() == n * size_t(g.dim) && g.observed.size() == n && g.probability.size() == n &&
-              g.bfs_level.size() == n,
-          kWrite, ": ", path, ": arrays of different lengths (expected ", n, ")");
-  require(int64_t(n) * g.dim <= kMaxValues, kWrite, ": ", path, ": expected at most ", kMaxValues,
-          " values, found ", n, " x ", g.dim);
+  requireRows(g, joinText(kWrite, ": ", path));
+  require(g.size() * g.dim <= kMaxValues, kWrite, ": ", path, ": expected at most ", kMaxValues,
+          " values, found ", g.size(), " x ", g.dim);
   requireTokens(kWrite, g, path);
-  for (const TokenMask* mask : {&file.seen.filled, &file.seen.empty}) {
+  for (const TokenMask* mask : {&g.seen->filled, &g.seen->empty}) {
     CoordBBox box;
     require(!mask->evalActiveVoxelBoundingBox(box) || g.frame.bounds.isInside(box), kWrite, ": ",
             path, ": voxels ", box, " lie outside the volume ", g.frame.bounds);
   }
 }
 
-void fillLeaf(const LatentGrid& g, const std::vector<int64_t>& sorted, const LeafRows& range) {
+void fillLeaf(const Place& g, const std::vector<int64_t>& sorted, const LeafRows& range) {
   PointLeaf& leaf = *range.leaf;
   auto position = writeHandle<openvdb::Vec3f, ExactCodec>(leaf, "P");
-  auto z = writeHandle<float, HalfCodec>(leaf, kZ);
-  auto probability = writeHandle<float, ExactCodec>(leaf, kProbability);
-  auto bfs_level = writeHandle<int32_t, ExactCodec>(leaf, kBfsLevel);
-  auto generated = writeHandle<bool, ExactCodec>(leaf, kGenerated);
   auto number = writeHandle<int32_t, ExactCodec>(leaf, kRow);
   for (size_t i = range.begin; i < range.end; ++i) {
-    const size_t row = size_t(sorted[i]), dim = size_t(g.dim);
     const auto n = openvdb::Index(i - range.begin);
     position.set(n, openvdb::Vec3f(0));  // the node's centre
-    for (size_t c = 0; c < dim; ++c) z.set(n, openvdb::Index(c), g.z[row * dim + c]);
-    probability.set(n, g.probability[row]);
-    bfs_level.set(n, g.bfs_level[row]);
-    generated.set(n, g.observed[row] == 0);
-    number.set(n, int32_t(row));
+    number.set(n, int32_t(sorted[i]));
   }
+  forEachAttribute(g, [&](const auto& c, auto value, auto codec) {
+    auto handle = writeHandle<decltype(value), decltype(codec)>(leaf, c.name);
+    for (size_t i = range.begin; i < range.end; ++i)
+      for (size_t k = 0; k < c.width; ++k)
+        handle.set(openvdb::Index(i - range.begin), openvdb::Index(k),
+                   decltype(value)(c.values[size_t(sorted[i]) * c.width + k]));
+  });
 }
 
-PointGrid::Ptr latentGrid(const LatentGrid& g, const std::string& path) {
+PointGrid::Ptr latentGrid(const Place& g, const std::string& path) {
   using openvdb::points::appendAttribute;
   const auto layout = layOutPoints(
       g.ijk, openvdb::points::TypedAttributeArray<openvdb::Vec3f, ExactCodec>::attributeType());
@@ -100,10 +104,10 @@ PointGrid::Ptr latentGrid(const LatentGrid& g, const std::string& path) {
   }
   if (!layout.leaves.empty()) {
     PointTree& tree = *layout.tree;
-    appendAttribute<float, HalfCodec>(tree, kZ, 0.f, openvdb::Index(g.dim));
-    appendAttribute<float, ExactCodec>(tree, kProbability);
-    appendAttribute<int32_t, ExactCodec>(tree, kBfsLevel);
-    appendAttribute<bool, ExactCodec>(tree, kGenerated);
+    forEachAttribute(g, [&](const auto& c, auto value, auto codec) {
+      appendAttribute<decltype(value), decltype(codec)>(tree, c.name, value,
+                                                        openvdb::Index(c.width));
+    });
     appendAttribute<int32_t, ExactCodec>(tree, kRow);
     tbb::parallel_for(size_t(0), layout.leaves.size(),
                       [&](size_t l) { fillLeaf(g, layout.rows, layout.leaves[l]); });
@@ -112,17 +116,17 @@ PointGrid::Ptr latentGrid(const LatentGrid& g, const std::string& path) {
   auto grid = PointGrid::create(layout.tree);
   grid->setTransform(fileTransform(g.frame, g.level));
   grid->insertMeta("point_count", openvdb::Int64Metadata(g.size()));
-  grid->insertMeta("point_attributes",
-                   openvdb::StringMetadata("P z probability bfs_level generated row"));
+  std::string names = "P";
+  forEachAttribute(g, [&](const auto& c, auto, auto) { names += joinText(" ", c.name); });
+  grid->insertMeta("point_attributes", openvdb::StringMetadata(joinText(names, " ", kRow)));
   return grid;
 }
 
-openvdb::MetaMap metadataOf(const LatentFile& file) {
-  const LatentGrid& g = file.latents;
+openvdb::MetaMap metadataOf(const Place& g) {
   openvdb::MetaMap metadata;
   metadata.insertMeta("creator", openvdb::StringMetadata("vdb_complete"));
-  metadata.insertMeta(kHash, openvdb::StringMetadata(file.encoder_hash));
-  if (!file.growth.empty()) metadata.insertMeta(kGrowth, openvdb::StringMetadata(file.growth));
+  metadata.insertMeta(kHash, openvdb::StringMetadata(g.encoder_hash));
+  if (!g.growth.empty()) metadata.insertMeta(kGrowth, openvdb::StringMetadata(g.growth));
   metadata.insertMeta(kLevel, openvdb::Int32Metadata(g.level));
   metadata.insertMeta(kDim, openvdb::Int32Metadata(g.dim));
   insertVolume(g.frame, &metadata);
@@ -130,8 +134,7 @@ openvdb::MetaMap metadataOf(const LatentFile& file) {
   for (int row = 0; row < 4; ++row)
     for (int col = 0; col < 4; ++col) frame[row][col] = g.frame.world_from_grid.matrix()(col, row);
   metadata.insertMeta(kFrame, openvdb::Mat4DMetadata(frame));
-  const auto observed =
-      std::count_if(g.observed.begin(), g.observed.end(), [](uint8_t value) { return value != 0; });
+  const auto observed = std::count(g.generated.begin(), g.generated.end(), uint8_t(0));
   metadata.insertMeta("observed_count", openvdb::Int64Metadata(int64_t(observed)));
   metadata.insertMeta("generated_count", openvdb::Int64Metadata(g.size() - observed));
   return metadata;
@@ -152,15 +155,18 @@ VoxelFrame exactFrame(const openvdb::MetaMap& metadata, const VoxelFrame& approx
 }
 
 /// Leaves in tree order and the number of their points, at most one a node.
-std::vector<const PointLeaf*> checkedLeaves(const PointGrid& grid, int dim, size_t* count,
+std::vector<const PointLeaf*> checkedLeaves(const PointGrid& grid, const Place& g, size_t* count,
                                             const std::string& path) {
   std::vector<const PointLeaf*> leaves;
   *count = 0;
+  const auto requireAttribute = [&](const PointLeaf& leaf, const char* name, size_t width) {
+    require(hasAttribute(leaf, name), kRead, ": ", path, ": grid 'latent' has no attribute ", name);
+    const auto stride = leaf.constAttributeArray(name).stride();
+    require(size_t(stride) == width, kRead, ": ", path, ": expected ", name, " with ", width,
+            " values, found ", stride);
+  };
   for (auto leaf = grid.tree().cbeginLeaf(); leaf; ++leaf) {
     const size_t points = checkedPointCount(kRead, *leaf, path);
-    for (const char* name : {kZ, kProbability, kBfsLevel, kGenerated, kRow})
-      require(points == 0 || hasAttribute(*leaf, name), kRead, ": ", path,
-              ": grid 'latent' has no attribute ", name);
     openvdb::Index before = 0;
     for (openvdb::Index v = 0; v < PointLeaf::SIZE; ++v) {
       const auto end = openvdb::Index(leaf->getValue(v));
@@ -169,46 +175,42 @@ std::vector<const PointLeaf*> checkedLeaves(const PointGrid& grid, int dim, size
       before = end;
     }
     if (points == 0) continue;
-    const auto stride = leaf->constAttributeArray(kZ).stride();
-    require(int64_t(stride) == dim, kRead, ": ", path, ": expected z with ", dim, " values, found ",
-            stride);
+    forEachAttribute(g,
+                     [&](const auto& c, auto, auto) { requireAttribute(*leaf, c.name, c.width); });
+    requireAttribute(*leaf, kRow, 1);
     *count += points;
-    require(int64_t(*count) * dim <= kMaxValues, kRead, ": ", path, ": expected at most ",
+    require(int64_t(*count) * g.dim <= kMaxValues, kRead, ": ", path, ": expected at most ",
             kMaxValues, " values, found more");
     leaves.push_back(&*leaf);
   }
   return leaves;
 }
 
-void readLeaf(const PointLeaf& leaf, std::vector<uint8_t>* taken, LatentGrid* g,
+void readLeaf(const PointLeaf& leaf, std::vector<uint8_t>* taken, Place* g,
               const std::string& path) {
-  const auto z = readHandle<float>(leaf, kZ);
-  const auto probability = readHandle<float>(leaf, kProbability);
-  const auto bfs_level = readHandle<int32_t>(leaf, kBfsLevel);
-  const auto generated = readHandle<bool>(leaf, kGenerated);
   const auto number = readHandle<int32_t>(leaf, kRow);
-  openvdb::Index n = 0;
+  std::vector<size_t> rows;  // of the leaf's points
   for (openvdb::Index v = 0; v < PointLeaf::SIZE; ++v) {
-    if (openvdb::Index(leaf.getValue(v)) == n) continue;
-    const int64_t row = number.get(n);
-    require(row >= 0 && row < g->size() && !(*taken)[size_t(row)], kRead, ": ", path,
-            ": expected each row from 0 to ", g->size() - 1, " once, found ", row);
+    if (size_t(leaf.getValue(v)) == rows.size()) continue;
+    const int64_t row = number.get(openvdb::Index(rows.size()));
+    require(row >= 0 && row < int64_t(taken->size()) && !(*taken)[size_t(row)], kRead, ": ", path,
+            ": expected each row from 0 to ", taken->size() - 1, " once, found ", row);
     (*taken)[size_t(row)] = 1;
-    const size_t i = size_t(row), dim = size_t(g->dim);
-    g->ijk[i] = leaf.offsetToGlobalCoord(v);
-    for (size_t c = 0; c < dim; ++c) g->z[i * dim + c] = z.get(n, openvdb::Index(c));
-    g->probability[i] = probability.get(n);
-    g->bfs_level[i] = bfs_level.get(n);
-    g->observed[i] = !generated.get(n);
-    ++n;
+    g->ijk[size_t(row)] = leaf.offsetToGlobalCoord(v);
+    rows.push_back(size_t(row));
   }
+  forEachAttribute(*g, [&](auto c, auto value, auto) {
+    const auto handle = readHandle<decltype(value)>(leaf, c.name);
+    for (size_t n = 0; n < rows.size(); ++n)
+      for (size_t k = 0; k < c.width; ++k)
+        c.values[rows[n] * c.width + k] = handle.get(openvdb::Index(n), openvdb::Index(k));
+  });
 }
 
-void readTokens(const PointGrid& grid, LatentGrid* g, const std::string& path) {
+void readTokens(const PointGrid& grid, Place* g, const std::string& path) {
   size_t n = 0;
-  const std::vector<const PointLeaf*> leaves = checkedLeaves(grid, g->dim, &n, path);
-  g->ijk.resize(n), g->z.resize(n * size_t(g->dim));
-  g->observed.resize(n), g->probability.resize(n), g->bfs_level.resize(n);
+  const std::vector<const PointLeaf*> leaves = checkedLeaves(grid, *g, &n, path);
+  forEachColumn([&](auto c) { c.values.resize(n * c.width); }, *g);
   std::vector<uint8_t> taken(n, 0);
   for (const PointLeaf* leaf : leaves) readLeaf(*leaf, &taken, g, path);
   requireTokens(kRead, *g, path);
@@ -216,15 +218,15 @@ void readTokens(const PointGrid& grid, LatentGrid* g, const std::string& path) {
 
 }  // namespace
 
-void writeLatentVdb(const LatentFile& file, const std::string& path) {
-  requireWritable(file, path);
+void writeLatentVdb(const Place& place, const std::string& path) {
+  requireWritable(place, path);
   openvdb::initialize();
   const std::pair<const char*, openvdb::GridBase::Ptr> named[] = {
-      {kLatent, latentGrid(file.latents, path)},
-      {kFilled, gridOfMask(file.seen.filled)},
-      {kEmpty, gridOfMask(file.seen.empty)},
+      {kLatent, latentGrid(place, path)},
+      {kFilled, gridOfMask(place.seen->filled)},
+      {kEmpty, gridOfMask(place.seen->empty)},
   };
-  const auto voxels = fileTransform(file.latents.frame);
+  const auto voxels = fileTransform(place.frame);
   openvdb::GridCPtrVec grids;
   for (const auto& [name, grid] : named) {
     grid->setName(name);
@@ -232,16 +234,15 @@ void writeLatentVdb(const LatentFile& file, const std::string& path) {
     if (name != kLatent) grid->setTransform(voxels);
     grids.push_back(grid);
   }
-  writeVdb(kWrite, path, grids, metadataOf(file));
+  writeVdb(kWrite, path, grids, metadataOf(place));
 }
 
-LatentFile readLatentVdb(const std::string& path) {
+Place readLatentVdb(const std::string& path) {
   const auto [grids, metadata] = readVdb(kRead, path, kMaxBytes);
   const auto tokens = findGrid<PointGrid>(kRead, grids, kLatent, path);
   const auto filled = findGrid<BoolGrid>(kRead, grids, kFilled, path);
   const auto empty = findGrid<BoolGrid>(kRead, grids, kEmpty, path);
-  LatentFile file;
-  LatentGrid& g = file.latents;
+  Place g;
   g.level = findMetadata<int32_t>(kRead, metadata, kLevel, path);
   g.dim = findMetadata<int32_t>(kRead, metadata, kDim, path);
   require(g.level >= 0 && g.level < kTokenLevels && g.dim > 0 && g.dim <= kMaxDim, kRead, ": ",
@@ -252,16 +253,18 @@ LatentFile readLatentVdb(const std::string& path) {
                                     {empty.get(), 0}})
     g.frame =
         exactFrame(metadata, readVolume(kRead, metadata, grid->transform(), level, path), path);
-  file.encoder_hash = findMetadata<std::string>(kRead, metadata, kHash, path);
-  if (metadata[kGrowth]) file.growth = findMetadata<std::string>(kRead, metadata, kGrowth, path);
+  g.encoder_hash = findMetadata<std::string>(kRead, metadata, kHash, path);
+  if (metadata[kGrowth]) g.growth = findMetadata<std::string>(kRead, metadata, kGrowth, path);
   try {
     readTokens(*tokens, &g, path);
   } catch (const openvdb::Exception& error) {  // an attribute of another type
     throw Error(joinText(kRead, ": ", path, ": corrupt or unreadable: ", error.what()));
   }
-  file.seen.filled.root() = maskOfGrid(kRead, *filled, g.frame.bounds, path).root();
-  file.seen.empty.root() = maskOfGrid(kRead, *empty, g.frame.bounds, path).root();
-  return file;
+  const auto seen = std::make_shared<SeenSpace>();
+  seen->filled.root() = maskOfGrid(kRead, *filled, g.frame.bounds, path).root();
+  seen->empty.root() = maskOfGrid(kRead, *empty, g.frame.bounds, path).root();
+  g.seen = seen;
+  return g;
 }
 
 }  // namespace vdbc

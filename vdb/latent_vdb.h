@@ -1,18 +1,10 @@
 #pragma once
-// Latents as a .vdb file: what the decoder takes, and the weights that it has to have.
+// A place as a .vdb file: what the decoder takes and the completer goes on from.
 #include <string>
 
-#include "vdb/latent_grid.h"
+#include "vdb/place.h"
 
 namespace vdbc {
-
-/// Latents, what the views observed, and which encoder made them.
-struct LatentFile {
-  LatentGrid latents;
-  ObservedSpace seen;
-  std::string encoder_hash;  // Encoder::hash()
-  std::string growth;        // where a completion that was cut short goes on; else empty
-};
 
 /// Writes a points grid `latent` with one point at each node's centre: P, z (half, stride dim),
 /// probability, bfs_level, generated, row; bool grids `filled` and `empty` of the voxels seen;
@@ -21,10 +13,10 @@ struct LatentFile {
 /// order. A checksum follows. Temporary name, then rename. docs/formats.md. Spec E10. Throws Error
 /// for arrays of different lengths, tokens outside the volume or twice the same, values that are
 /// not finite or too large for a half, and where the file cannot be written.
-void writeLatentVdb(const LatentFile& file, const std::string& path);
+void writeLatentVdb(const Place& place, const std::string& path);
 
 /// Reads what writeLatentVdb wrote, also when another program wrote the file again. Throws Error on
 /// files that are missing, corrupt, lack a part or say what cannot be.
-LatentFile readLatentVdb(const std::string& path);
+Place readLatentVdb(const std::string& path);
 
 }  // namespace vdbc

@@ -1,5 +1,6 @@
-// The files of scene_volume.h. Slow to compile, like everything that walks several types of trees.
-#include <openvdb/math/Maps.h>
+// Slow to compile, like everything that walks several types of trees.
+#include "vdb/scene_vdb.h"
+
 #include <openvdb/openvdb.h>
 #include <tbb/parallel_for.h>
 
@@ -8,26 +9,52 @@
 #include <cmath>
 
 #include "vdb/grid_instances.h"
-#include "vdb/scene_volume.h"
 #include "vdb/vdb_file.h"
 
 namespace vdbc {
 namespace {
 
-using Eigen::Matrix3d;
-using Eigen::Vector3d;
+constexpr int kBandVoxels = 3;  // half width of `surface`
 
-constexpr int kBandVoxels = 3;  // half width of `surface`, formats.md 2.3
-
-// Names of the grids: the format, shared by writer and reader.
+// Grids beside those that SceneVoxels::columns() names.
 constexpr const char* kSurface = "surface";
-constexpr const char* kDensity = "density";
-constexpr const char* kColour = "Cd";
-constexpr const char* kObserved = "observed";
 constexpr const char* kGenerated = "generated";
-constexpr const char* kProbability = "probability";
-constexpr const char* kBfsLevel = "bfs_level";
 constexpr const char* kSeenEmpty = "seen_empty";
+
+// The grid that holds a column, and its values as the grid has them and back.
+template <typename Value>
+struct GridOf;
+template <>
+struct GridOf<float> {
+  using Grid = FloatGrid;
+};
+template <>
+struct GridOf<int32_t> {
+  using Grid = FloatGrid;
+};
+template <>
+struct GridOf<uint8_t> {
+  using Grid = BoolGrid;
+};
+template <>
+struct GridOf<Eigen::Vector3f> {
+  using Grid = Vec3SGrid;
+};
+template <typename Value>
+Value toGrid(const Value& value) {
+  return value;
+}
+openvdb::Vec3f toGrid(const Eigen::Vector3f& v) { return {v.x(), v.y(), v.z()}; }
+// False where the grid's value is none that the column can have.
+bool fromGrid(bool from, uint8_t* to) { return *to = from, true; }
+bool fromGrid(float from, float* to) { return *to = from, std::isfinite(from); }
+bool fromGrid(float from, int32_t* to) {
+  const bool is_count = from >= 0 && from <= float(1 << 24);
+  return *to = is_count ? int32_t(from) : 0, is_count;
+}
+bool fromGrid(const openvdb::Vec3f& from, Eigen::Vector3f* to) {
+  return *to = {from.x(), from.y(), from.z()}, std::isfinite(from.lengthSqr());
+}
 
 /// Exact signed distance (world units, negative inside) to the boundary of the union of the active
 /// voxels of `solid`, in a band of kBandVoxels at both sides. Squared distances to boxes add up
@@ -120,13 +147,10 @@ typename GridType::Ptr voxelGrid(const std::vector<Coord>& ijk, const Value& val
 }
 
 void requireWritable(const SceneVoxels& v, const std::string& path) {
-  const size_t n = v.ijk.size();
-  require(v.colour_linear.size() == n && v.density.size() == n && v.observed.size() == n &&
-              v.probability.size() == n && v.bfs_level.size() == n,
-          "writeSceneVdb: ", path, ": arrays of different lengths (expected ", n, ")");
+  requireRows(v, joinText("writeSceneVdb: ", path));
   require(std::isfinite(v.frame.voxel_m) && v.frame.voxel_m > 0, "writeSceneVdb: ", path,
           ": expected a positive voxel size, found ", v.frame.voxel_m);
-  for (size_t i = 0; i < n; ++i) {
+  for (size_t i = 0; i < v.ijk.size(); ++i) {
     require(v.frame.bounds.isInside(v.ijk[i]), "writeSceneVdb: ", path, ": voxel ", v.ijk[i],
             " lies outside the volume ", v.frame.bounds);
     require(v.colour_linear[i].allFinite() && std::isfinite(v.density[i]) &&
@@ -136,20 +160,6 @@ void requireWritable(const SceneVoxels& v, const std::string& path) {
 }
 
 }  // namespace
-
-openvdb::math::Transform::Ptr fileTransform(const VoxelFrame& frame, int level) {
-  const double edge = double(frame.voxel_m) * (1 << level);
-  const Matrix3d scaled = frame.world_from_grid.linear() * edge;
-  const Vector3d centre = frame.toWorld(Vector3d::Constant(0.5 * (1 << level)));
-  openvdb::Mat4d m = openvdb::Mat4d::identity();
-  for (int row = 0; row < 3; ++row) {
-    for (int col = 0; col < 3; ++col) m[row][col] = scaled(col, row);
-    m[3][row] = centre[row];
-  }
-  // simplify(): without rotation it is a plain scale and translation, which more tools understand.
-  return std::make_shared<openvdb::math::Transform>(
-      openvdb::math::simplify(std::make_shared<openvdb::math::AffineMap>(m)));
-}
 
 void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
   requireWritable(voxels, path);
@@ -163,25 +173,28 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
       if (voxels.observed[i] || !empty.isValueOn(voxels.ijk[i])) cells.setValueOn(voxels.ijk[i]);
   }
   const auto& v = voxels;
-  const auto density = voxelGrid<FloatGrid>(v.ijk, [&](size_t i) { return v.density[i]; });
-  require(density->activeVoxelCount() == v.ijk.size(), "writeSceneVdb: ", path, ": expected ",
-          v.ijk.size(), " different voxels, found ", density->activeVoxelCount());
-  density->setGridClass(openvdb::GRID_FOG_VOLUME);
-  const auto colour = voxelGrid<Vec3SGrid>(v.ijk, [&](size_t i) {
-    return openvdb::Vec3f(v.colour_linear[i].x(), v.colour_linear[i].y(), v.colour_linear[i].z());
-  });
-  colour->setVectorType(openvdb::VEC_INVARIANT);
-
-  const std::pair<const char*, openvdb::GridBase::Ptr> named[] = {
-      {kSurface, boundaryLevelSet(solid, double(v.frame.voxel_m))},
-      {kDensity, density},
-      {kColour, colour},
-      {kObserved, voxelGrid<BoolGrid>(v.ijk, [&](size_t i) { return v.observed[i] != 0; })},
-      {kGenerated, voxelGrid<BoolGrid>(v.ijk, [&](size_t i) { return v.observed[i] == 0; })},
-      {kProbability, voxelGrid<FloatGrid>(v.ijk, [&](size_t i) { return v.probability[i]; })},
-      {kBfsLevel, voxelGrid<FloatGrid>(v.ijk, [&](size_t i) { return v.bfs_level[i]; })},
-      {kSeenEmpty, gridOfMask(v.empty)},
-  };
+  std::vector<std::pair<const char*, openvdb::GridBase::Ptr>> named = {
+      {kSurface, boundaryLevelSet(solid, double(v.frame.voxel_m))}};
+  forEachColumn(
+      [&](const auto& c) {
+        using Value = typename std::decay_t<decltype(c)>::Value;
+        if constexpr (!std::is_same_v<Value, Coord>) {
+          const auto grid = voxelGrid<typename GridOf<Value>::Grid>(
+              v.ijk, [&](size_t i) { return toGrid(c.values[i]); });
+          require(grid->activeVoxelCount() == v.ijk.size(), "writeSceneVdb: ", path, ": expected ",
+                  v.ijk.size(), " different voxels, found ", grid->activeVoxelCount());
+          if constexpr (std::is_same_v<Value, Eigen::Vector3f>)
+            grid->setVectorType(openvdb::VEC_INVARIANT);
+          named.emplace_back(c.name, grid);
+        }
+      },
+      v);
+  named[1].second->setGridClass(openvdb::GRID_FOG_VOLUME);  // `density` is the first column
+  // Where a tool wants to mask by what was made up, it should not have to invert a grid.
+  named.insert(
+      named.begin() + 4,
+      {kGenerated, voxelGrid<BoolGrid>(v.ijk, [&](size_t i) { return v.observed[i] == 0; })});
+  named.emplace_back(kSeenEmpty, gridOfMask(v.empty));
   openvdb::GridCPtrVec grids;
   const auto transform = fileTransform(v.frame);
   for (const auto& [name, grid] : named) {
@@ -236,11 +249,7 @@ SceneVoxels readSceneVdb(const std::string& path) {
   constexpr const char* kOperation = "readSceneVdb";
   constexpr uint64_t kMaxBytes = uint64_t(1) << 32;
   const auto [grids, metadata] = readVdb(kOperation, path, kMaxBytes);
-  const auto density = findGrid<FloatGrid>(kOperation, grids, kDensity, path);
-  const auto colour = findGrid<Vec3SGrid>(kOperation, grids, kColour, path);
-  const auto observed = findGrid<BoolGrid>(kOperation, grids, kObserved, path);
-  const auto probability = findGrid<FloatGrid>(kOperation, grids, kProbability, path);
-  const auto bfs_level = findGrid<FloatGrid>(kOperation, grids, kBfsLevel, path);
+  const auto density = findGrid<FloatGrid>(kOperation, grids, "density", path);
   const auto empty = findGrid<BoolGrid>(kOperation, grids, kSeenEmpty, path);
   for (const openvdb::GridBase::Ptr& grid : grids)
     require(grid->transform() == density->transform(), "readSceneVdb: ", path, ": grid '",
@@ -260,27 +269,22 @@ SceneVoxels readSceneVdb(const std::string& path) {
     value.getBoundingBox(box);
     require(voxels.frame.bounds.isInside(box), "readSceneVdb: ", path, ": voxels ", box,
             " lie outside the volume ", voxels.frame.bounds);
-    for (const Coord& ijk : box) {
-      voxels.ijk.push_back(ijk);
-      voxels.density.push_back(*value);
-    }
+    for (const Coord& ijk : box) voxels.ijk.push_back(ijk);
   }
-  const auto colours = colour->getConstUnsafeAccessor();
-  const auto observeds = observed->getConstUnsafeAccessor();
-  const auto probabilities = probability->getConstUnsafeAccessor();
-  const auto levels = bfs_level->getConstUnsafeAccessor();
-  for (size_t i = 0; i < voxels.ijk.size(); ++i) {
-    const Coord& ijk = voxels.ijk[i];
-    const openvdb::Vec3f c = colours.getValue(ijk);
-    const float p = probabilities.getValue(ijk), level = levels.getValue(ijk);
-    require(std::isfinite(c.lengthSqr()) && std::isfinite(voxels.density[i]) && std::isfinite(p) &&
-                level >= 0 && level <= float(1 << 24),
-            "readSceneVdb: ", path, ": voxel ", ijk, " has a value that makes no sense");
-    voxels.colour_linear.emplace_back(c.x(), c.y(), c.z());
-    voxels.observed.push_back(observeds.getValue(ijk));
-    voxels.probability.push_back(p);
-    voxels.bfs_level.push_back(int32_t(level));
-  }
+  forEachColumn(
+      [&](auto c) {
+        using Value = typename std::decay_t<decltype(c)>::Value;
+        if constexpr (!std::is_same_v<Value, Coord>) {
+          const auto grid = findGrid<typename GridOf<Value>::Grid>(kOperation, grids, c.name, path);
+          const auto value = grid->getConstUnsafeAccessor();
+          c.values.resize(voxels.ijk.size());
+          for (size_t i = 0; i < voxels.ijk.size(); ++i)
+            require(fromGrid(value.getValue(voxels.ijk[i]), &c.values[i]), kOperation, ": ", path,
+                    ": voxel ", voxels.ijk[i], " of '", c.name,
+                    "' has a value that makes no sense");
+        }
+      },
+      voxels);
   voxels.empty.root() = maskOfGrid(kOperation, *empty, voxels.frame.bounds, path).root();
   return voxels;
 }

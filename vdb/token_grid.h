@@ -6,7 +6,7 @@
 //   level 2  coarse           a node of 4^3, or a tile in its parent   0.4 m
 //
 // A level-l coordinate is ijk >> l (floor). Trees for computing are 2-4-128 (below); files carry
-// standard 5-4-3 grids only, conversion happens in scene_volume.h.
+// standard 5-4-3 grids only, conversion happens in scene_vdb.h.
 #include <openvdb/Types.h>
 #include <openvdb/tree/Tree.h>
 

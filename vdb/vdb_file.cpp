@@ -10,7 +10,6 @@
 #include <sstream>
 
 #include "vdb/file_io.h"
-#include "vdb/scene_volume.h"
 
 namespace vdbc {
 namespace {
@@ -98,6 +97,20 @@ VdbFile readVdb(const char* operation, const std::string& path, uint64_t max_byt
                          "or of another kind (",
                          message, ")"));
   }
+}
+
+openvdb::math::Transform::Ptr fileTransform(const VoxelFrame& frame, int level) {
+  const double edge = double(frame.voxel_m) * (1 << level);
+  const Eigen::Matrix3d scaled = frame.world_from_grid.linear() * edge;
+  const Eigen::Vector3d centre = frame.toWorld(Eigen::Vector3d::Constant(0.5 * (1 << level)));
+  openvdb::Mat4d m = openvdb::Mat4d::identity();
+  for (int row = 0; row < 3; ++row) {
+    for (int col = 0; col < 3; ++col) m[row][col] = scaled(col, row);
+    m[3][row] = centre[row];
+  }
+  // simplify(): without rotation it is a plain scale and translation, which more tools understand.
+  return std::make_shared<openvdb::math::Transform>(
+      openvdb::math::simplify(std::make_shared<openvdb::math::AffineMap>(m)));
 }
 
 void insertVolume(const VoxelFrame& frame, openvdb::MetaMap* metadata) {

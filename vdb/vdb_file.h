@@ -6,8 +6,10 @@
 
 #include <string>
 
-#include "vdb/carve.h"
+#include "vdb/error.h"
+#include "vdb/frame.h"
 #include "vdb/grid_instances.h"
+#include "vdb/token_grid.h"
 
 namespace vdbc {
 
@@ -48,6 +50,10 @@ Value findMetadata(const char* operation, const openvdb::MetaMap& metadata, cons
           Meta::staticTypeName());
   return found->value();
 }
+
+/// The frame as files have it, for grids of the nodes of `level` (0: voxels): row vectors, node
+/// centres at whole indices.
+openvdb::math::Transform::Ptr fileTransform(const VoxelFrame& frame, int level = 0);
 
 /// Adds `voxel_m`, `volume_min`, `volume_max` (voxels, inclusive).
 void insertVolume(const VoxelFrame& frame, openvdb::MetaMap* metadata);

@@ -222,7 +222,7 @@ ordered_json seenShares(const RoomTruth& truth, const std::vector<View>& views, 
   std::vector<DepthView> depth;
   for (int i = 0; i < count; ++i) depth.push_back(views[size_t(i)].depthView());
   Progress silent;
-  const ObservedSpace seen = carve(truth.frame, depth, CarveSettings(), silent);
+  const SeenSpace seen = carve(truth.frame, depth, CarveSettings(), silent);
   std::array<int64_t, 3> counts = {0, 0, 0};
   for (auto c = truth.frame.bounds.begin(); c; ++c)
     if (truth.space.filled.isValueOn(*c) || truth.space.empty.isValueOn(*c))

@@ -153,7 +153,7 @@ std::vector<Coord> surfaceNodes(const TriangleMesh& mesh, const VoxelFrame& fram
 /// grid is aligned with the room and holds it with a margin of one coarse node.
 struct RoomTruth {
   VoxelFrame frame;
-  ObservedSpace space;                                         // level 0
+  SeenSpace space;                                             // level 0
   std::array<std::vector<Coord>, kTokenLevels> surface_nodes;  // occupancy by level, in the bounds
 };
 RoomTruth roomTruth(const Room& room, float voxel_m);

@@ -11,8 +11,8 @@
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
 #include "vdb/file_io.h"
+#include "vdb/fit_volume.h"
 #include "vdb/grid_instances.h"
-#include "vdb/scene_volume.h"
 
 namespace vdbc {
 
@@ -138,7 +138,7 @@ std::vector<Coord> clipped(std::vector<Coord> nodes, const CoordBBox& bounds, in
 }
 
 /// Everything that faces of free voxels lead to from `seeds` without entering a filled voxel.
-void floodEmpty(const VoxelFrame& frame, const std::vector<Coord>& seeds, ObservedSpace* space) {
+void floodEmpty(const VoxelFrame& frame, const std::vector<Coord>& seeds, SeenSpace* space) {
   openvdb::tree::ValueAccessor<const TokenMask> filled(space->filled);
   openvdb::tree::ValueAccessor<TokenMask> empty(space->empty);
   std::vector<Coord> open;

@@ -1,6 +1,6 @@
 // Laws of the volume and its files: gravity and walls are found, T^-1 T = id (spec E3), what is
 // written is what is read, `surface` is a distance, and other programs agree.
-#include "vdb/scene_volume.h"
+#include "vdb/scene_vdb.h"
 
 #include <gtest/gtest.h>
 #include <openvdb/io/File.h>

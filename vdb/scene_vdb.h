@@ -1,42 +1,12 @@
 #pragma once
-// Where the grid lies in the world, and the grids that leave the program (formats.md 2.3).
-#include <openvdb/math/Transform.h>
-
-#include <optional>
+// The grids that leave the program (docs/formats.md), one value a voxel.
 #include <string>
 #include <vector>
 
 #include "vdb/carve.h"
+#include "vdb/columns.h"
 
 namespace vdbc {
-
-constexpr int kMaxVolumeSide = 4096;  // voxels
-constexpr int kMaxVolumeIndex =
-    1 << 28;  // voxels; far inside int32, so sums of coordinates are too
-
-struct VolumeSettings {
-  float voxel_m = 0.1f;
-  /// Unit vector that points up in the input's world frame.
-  Eigen::Vector3d up = Eigen::Vector3d::UnitZ();
-  /// World box (min, max corners, metres) to complete; else fitted to what was seen.
-  std::optional<Eigen::AlignedBox3d> bounds;
-  float margin_m = 1.5f;           // horizontal room for what was not seen, when fitted
-  float vertical_margin_m = 0.4f;  // the same above and below
-  bool align_walls = true;         // turn the grid about `up` so that walls lie along its axes
-};
-
-/// The volume of a scene: z of the grid is up, yaw follows the walls (strongest direction of the
-/// horizontal surface normals), the box holds the seen points (0.5 % outliers trimmed at each side)
-/// and the cameras, grown by the margins; bounds are multiples of 4 voxels. The grid's origin is
-/// the world's. With `bounds`, the grid keeps the world's heading: a turned box would be larger
-/// than was asked for. Decision 2 of the design. Throws Error if no view has a usable depth or the
-/// volume would exceed 4,096 voxels a side.
-VoxelFrame fitVolume(const std::vector<DepthView>& views, const VolumeSettings& settings,
-                     const CarveSettings& carving);
-
-/// The frame as files have it, for grids of the nodes of `level` (0: voxels): row vectors, node
-/// centres at whole indices.
-openvdb::math::Transform::Ptr fileTransform(const VoxelFrame& frame, int level = 0);
 
 /// What a finished scene says about its voxels; arrays are parallel, [N].
 struct SceneVoxels {
@@ -48,6 +18,15 @@ struct SceneVoxels {
   std::vector<float> probability;  // its token's, which tau is compared with; 1 for observed
   std::vector<int32_t> bfs_level;  // growth level, 0 for observed
   TokenMask empty;                 // E of the input views (kept open in `surface`)
+
+  int64_t size() const { return int64_t(ijk.size()); }
+
+  template <typename Self>
+  static auto columns(Self& v) {
+    return std::make_tuple(column("ijk", v.ijk), column("density", v.density),
+                           column("Cd", v.colour_linear), column("observed", v.observed),
+                           column("probability", v.probability), column("bfs_level", v.bfs_level));
+  }
 };
 
 /// Writes standard 5-4-3 grids: surface (level set), density (fog), Cd (vec3s), observed, generated

@@ -1,4 +1,4 @@
-#include "vdb/scene_volume.h"
+#include "vdb/fit_volume.h"
 
 #include <tbb/parallel_for.h>
 
