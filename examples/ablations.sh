@@ -8,7 +8,7 @@ set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
 folder=${1:-$root/out/ablations}
 steps=${2:-400}
-program=${VDB_COMPLETE:-$root/build/release/vdb_complete}
+program=${VDB_LAB:-$root/build/release/vdb_lab}
 results=$root/docs/results
 mkdir -p "$folder/runs"
 

@@ -7,7 +7,7 @@
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
 rooms=${1:-65-72}
-program=${VDB_COMPLETE:-$root/build/release/vdb_complete}
+program=${VDB_LAB:-$root/build/release/vdb_lab}
 mkdir -p "$root/out"
 
 row() {

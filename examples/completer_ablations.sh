@@ -10,6 +10,7 @@ root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
 folder=${1:-$root/out/completer_ablations}
 steps=${2:-500}
 program=${VDB_COMPLETE:-$root/build/release/vdb_complete}
+lab=${VDB_LAB:-$root/build/release/vdb_lab}
 weights=$root/weights/small
 results=$root/docs/results
 mkdir -p "$folder/runs" "$folder/judged" "$folder/samples"
@@ -31,7 +32,7 @@ run() {
   for change in "$@"; do sets="$sets --set $change"; done
   echo "$name" >&2
   # shellcheck disable=SC2086  # one word each
-  "$program" train mar --encoder "$weights/encoder.safetensors" -o "$out" --cache "$folder/rooms" --rooms 320 --steps "$steps" \
+  "$lab" train mar --encoder "$weights/encoder.safetensors" -o "$out" --cache "$folder/rooms" --rooms 320 --steps "$steps" \
     --rate 4e-4 --threads 1 --seed "$seed" $start $sets >"$out.txt" 2>"$out.err"
 }
 
@@ -41,7 +42,7 @@ judge() {
   shift 2
   if [ -s "$folder/judged/$name.jsonl" ]; then return; fi
   echo "judging $name" >&2
-  "$program" eval --scenes "rooms:${ROOMS:-65-80}" --views 2 --weights "$folder/runs/$run" --threads 1 --json "$@" \
+  "$lab" eval --scenes "rooms:${ROOMS:-65-80}" --views 2 --weights "$folder/runs/$run" --threads 1 --json "$@" \
     2>>"$folder/judged/$name.err" | grep '"method":"completed"' >"$folder/part.jsonl"
   mv "$folder/part.jsonl" "$folder/judged/$name.jsonl"
 }

@@ -6,23 +6,24 @@ set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
 data=${1:-$root/../shared/data}
 program=$root/build/release/vdb_complete
+lab=$root/build/release/vdb_lab
 results=$root/docs/results
 mkdir -p "$results" "$root/out"
 : >"$root/out/figures.log"
 
-"$program" eval --reconstruct --scenes rooms:1-8 --json 2>>"$root/out/figures.log" >"$results/rooms_reconstruct.jsonl"
-"$program" eval --reconstruct --scenes homes:0-8 --json 2>>"$root/out/figures.log" >"$results/homes_reconstruct.jsonl"
+"$lab" eval --reconstruct --scenes rooms:1-8 --json 2>>"$root/out/figures.log" >"$results/rooms_reconstruct.jsonl"
+"$lab" eval --reconstruct --scenes homes:0-8 --json 2>>"$root/out/figures.log" >"$results/homes_reconstruct.jsonl"
 "$program" "$root/examples/two_views" -o "$root/out/two_views.vdb" --json 2>>"$root/out/figures.log" >"$results/two_views.json"
 cp "$root/out/two_views.png" "$root/docs/two_views.png"
 if [ -d "$data/rgbd_redkitchen" ]; then
   "$program" "$data/rgbd_redkitchen" --frames 0,6,12,18 -o "$root/out/redkitchen.vdb" --json 2>>"$root/out/figures.log" \
     >"$results/redkitchen_4_views.json"
-  "$program" eval --scenes "$data/rgbd_redkitchen" --frames 0,6,12,18 --json 2>>"$root/out/figures.log" \
+  "$lab" eval --scenes "$data/rgbd_redkitchen" --frames 0,6,12,18 --json 2>>"$root/out/figures.log" \
     >"$results/redkitchen_eval.jsonl"
   for capture in redkitchen diningroom livingroom_rendered; do
     views=12
     [ "$capture" = redkitchen ] || views=3  # of five frames
-    "$program" eval --reconstruct --views "$views" --scenes "$data/rgbd_$capture" --json 2>>"$root/out/figures.log" \
+    "$lab" eval --reconstruct --views "$views" --scenes "$data/rgbd_$capture" --json 2>>"$root/out/figures.log" \
       >"$results/${capture}_reconstruct.jsonl"
   done
 fi

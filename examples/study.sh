@@ -10,7 +10,7 @@
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd -P)
 folder=${1:-$root/docs}
-program=${VDB_COMPLETE:-$root/build/release/vdb_complete}
+program=${VDB_LAB:-$root/build/release/vdb_lab}
 views="${VIEWS:-1 2 4 8 12}"
 taus=".1 .2 .3 .4 .5 .6"
 some=rooms:${ROOMS:-1-16} more=rooms:${MORE_ROOMS:-17-64} all_homes=homes:${HOMES:-0-23}

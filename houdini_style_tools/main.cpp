@@ -1,54 +1,29 @@
 // vdb_complete: verbs, options and exit codes.
 #include <ATen/Parallel.h>
-#include <malloc.h>
 #include <tbb/global_control.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
 #include <nlohmann/json.hpp>
-#include <thread>
 
-#include "encoder/encoder_train.h"
 #include "houdini_style_tools/blas.h"
 #include "houdini_style_tools/checkpoint.h"
 #include "houdini_style_tools/complete.h"
 #include "houdini_style_tools/console.h"
-#include "houdini_style_tools/reconstruct.h"
+#include "houdini_style_tools/options.h"
 #include "houdini_style_tools/render.h"
-#include "houdini_style_tools/scenes.h"
-#include "houdini_style_tools/scores.h"
+#include "splat/embree_check.h"
 #include "vdb/latent_vdb.h"
 #include "vdb/mask_vdb.h"
+#include "vdb/process.h"
 
 namespace vdbc {
 namespace {
 
-namespace fs = std::filesystem;
 using nlohmann::ordered_json;
 
-// Options, one struct a verb; names as on the command line.
-struct Common {
-  uint64_t seed = 1;
-  int threads = 0;
-  bool json = false;
-};
-struct Complete {
-  std::string views, frames, output, weights, region, lock;
-  int from_level = 1, samples = 1;
-  bool resume = false;
-  std::vector<double> up, bounds;
-  double scale = 0;
-  double margin = VolumeSettings().margin_m;
-  double tau = CompleteSettings().tau, coarse_tau = CompleteSettings().coarse_tau;
-  double hole_tau = CompleteSettings().hole_tau;
-  double child_tau = SceneSettings().child_threshold;
-  double temperature = 1;
-  int sampling_steps = 0;
-  bool generated_context = false, refine_observed = false, antialias = false;
-};
 struct Render {
   RenderSettings settings;
   std::string frames;
@@ -68,105 +43,13 @@ struct Check {
   std::string views, frames, volume;
   double scale = 0;
 };
-struct Evaluate {
-  std::string scenes, frames, weights, lpips, features, pictures;
-  int views = 2;
-  std::vector<double> taus;
-  int context_tokens = 0, chunk_tokens = 0;
-  bool random_order = false, reconstruct = false;
-  double optimise_seconds = OptimiseSettings().seconds;
-};
-struct Train {
-  std::string output, work, cache, preset = "small", encoder, from;
-  std::vector<std::string> changes;
-  int64_t steps = 0, scenes = 0, batch = 1;
-  double rate = 0;
-  bool resume = false, mixed_precision = false;
-};
-
-// "0,3,5-9" -> 0 3 5 6 7 8 9.
-std::vector<int> frameList(const std::string& text) {
-  std::vector<int> frames;
-  std::stringstream parts(text);
-  for (std::string part; std::getline(parts, part, ',');) {
-    int first = 0, last = 0, used = 0;
-    const int found = std::sscanf(part.c_str(), "%d%n-%d%n", &first, &used, &last, &used);
-    if (found == 1) last = first;
-    if (found < 1 || size_t(used) != part.size() || first < 0 || last < first ||
-        last - first > 100000)
-      throw UsageError(
-          joinText("--frames: ", text, ": expected numbers and ranges such as 0,3,5-9"));
-    for (int f = first; f <= last; ++f) frames.push_back(f);
-  }
-  return frames;
-}
-
-std::string executableFolder() {
-  std::error_code error;
-  const fs::path self = fs::read_symlink("/proc/self/exe", error);
-  return error ? "." : self.parent_path().string();
-}
-
-// The folder with encoder.safetensors and completer.safetensors.
-std::string weightsFolder(const std::string& given) {
-  if (!given.empty()) return given;
-  for (const char* place : {"/../../weights/small", "/../share/vdb_complete/weights/small"}) {
-    const std::string folder = executableFolder() + place;
-    if (fs::exists(folder + "/encoder.safetensors")) return fs::weakly_canonical(folder).string();
-  }
-  throw Error(
-      "--weights: no trained weights beside the program (expected weights/small; use --weights "
-      "FOLDER)");
-}
-
-SceneSettings sceneSettings(const Complete& o, const Common& common, const Eigen::Vector3d& up) {
-  SceneSettings s;
-  s.observing.volume.up = up;
-  s.observing.volume.margin_m = float(o.margin);
-  if (!o.bounds.empty()) {
-    s.observing.volume.bounds =
-        Eigen::AlignedBox3d(Eigen::Vector3d(o.bounds[0], o.bounds[1], o.bounds[2]),
-                            Eigen::Vector3d(o.bounds[3], o.bounds[4], o.bounds[5]));
-    const Eigen::Vector3d sizes = s.observing.volume.bounds->sizes();
-    if (!sizes.allFinite() || sizes.minCoeff() <= 0)
-      throw UsageError(
-          "--bounds: expected a box: x0 y0 z0 x1 y1 z1 with each second corner larger");
-  }
-  s.completion.tau = float(o.tau), s.completion.coarse_tau = float(o.coarse_tau);
-  s.completion.hole_tau = float(o.hole_tau);
-  s.child_threshold = float(o.child_tau);
-  s.completion.sampling_steps = o.sampling_steps, s.completion.temperature = o.temperature;
-  s.completion.generated_context = o.generated_context;
-  s.completion.refine_observed = o.refine_observed;
-  s.antialias = o.antialias;
-  s.completion.seed = common.seed;
-  return s;
-}
-
-Eigen::Vector3d upOf(const std::vector<double>& given) {
-  const Eigen::Vector3d up(given[0], given[1], given[2]);
-  if (!up.allFinite() || up.norm() < 1e-6)
-    throw UsageError("--up: expected a finite vector that is not zero");
-  return up.normalized();
-}
-
-// Code that only knows the views cannot say in an Error where they are from.
-template <typename Function>
-auto naming(const std::string& source, const Function& function) {
-  try {
-    return function();
-  } catch (const Error& e) {
-    throw Error(joinText(source, ": ", e.what()));
-  }
-}
-
 ReadViewsSettings reading(const std::string& frames, double scale) {
   ReadViewsSettings settings;
   settings.frames = frameList(frames), settings.metres_per_unit = scale;
   return settings;
 }
 
-Eigen::Vector3d upOf(const Complete& o) {
+Eigen::Vector3d sceneUp(const Complete& o) {
   return o.up.empty() ? conventionalUp(o.views) : upOf(o.up);
 }
 
@@ -200,7 +83,7 @@ struct SceneInput {
 
 SceneInput readScene(const Complete& o, const Common& common, const ReadViewsSettings& chosen) {
   std::vector<View> views = readViews(o.views, chosen);
-  const Eigen::Vector3d up = upOf(o);
+  const Eigen::Vector3d up = sceneUp(o);
   return {std::move(views), up, sceneSettings(o, common, up)};
 }
 
@@ -522,275 +405,9 @@ void cookCheck(const Check& o, const Common& common) {
   }
 }
 
-// FOLDER/N.png of scene N, which can be created; "" where no pictures are wanted.
-std::string pictureOf(const Evaluate& o, int64_t scene) {
-  if (o.pictures.empty()) return "";
-  const std::string picture = joinText(o.pictures, "/", scene, ".png");
-  requireCreatable(picture);
-  return picture;
-}
-
-void cookEvaluate(const Evaluate& o, const Complete& options, const Common& common,
-                  Progress& progress) {
-  const SceneList scenes = sceneList(o.scenes, o.views, frameList(o.frames), common.seed);
-  UserNets nets;
-  if (!o.lpips.empty()) nets.lpips = std::make_shared<const PerceptualNet>(o.lpips);
-  if (!o.features.empty()) nets.features = std::make_shared<const FeatureNet>(o.features);
-  const std::string weights = weightsFolder(o.weights);
-  const Encoder encoder(weights + "/encoder.safetensors");
-  const Completer completer(weights + "/completer.safetensors");
-  SceneSettings settings = sceneSettings(options, common, Eigen::Vector3d::UnitZ());
-  settings.completion.random_order = o.random_order;
-  settings.completion.context_tokens = o.context_tokens,
-  settings.completion.chunk_tokens = o.chunk_tokens;
-  std::vector<MethodResult> all;
-  auto show = [&](const MethodResult& r) {
-    if (common.json) {
-      std::printf("%s\n", resultJson(r).c_str());
-      if (r.reliability) std::printf("%s\n", reliabilityJson(r).c_str());
-    } else {
-      char perceived[96] = "", calibrated[24] = "";
-      int used = 0;
-      if (nets.lpips) used = std::snprintf(perceived, sizeof perceived, "lpips %.3f  ", r.lpips);
-      if (!std::isnan(r.fid))
-        std::snprintf(perceived + used, sizeof perceived - size_t(used), "fid %.2f  kid %.4f  ",
-                      r.fid, r.kid);
-      if (!std::isnan(r.ece)) std::snprintf(calibrated, sizeof calibrated, "ece %.3f  ", r.ece);
-      std::printf(
-          "%-14s %-17s psnr %6.2f  ssim %.3f  flip %.3f  %sdepth %.3f m  precision %.3f  recall "
-          "%.3f (shell %.3f, furniture %.3f)  f1 %.3f  iou %.3f  outside %.0f  %sleak %.3f  %6.2f "
-          "s  %5.0f MB  %lld\n",
-          r.scene.c_str(), r.method.c_str(), r.psnr, r.ssim, r.flip, perceived, r.depth_median_m,
-          r.precision, r.recall, r.shell_recall, r.furniture_recall, r.f1, r.iou, r.outside,
-          calibrated, r.leak, r.seconds, r.peak_rss_mb, static_cast<long long>(r.gaussians));
-    }
-    std::fflush(stdout);
-  };
-  for (int64_t i = 0; i < scenes.count; ++i) {
-    const EvaluationScene scene = scenes.scene(i);
-    const std::string picture = pictureOf(o, i);
-    for (const MethodResult& r : naming(scene.name, [&] {
-           return evaluateScene(scene, encoder, completer, settings, o.taus, picture, progress,
-                                nets);
-         })) {
-      show(r);
-      all.push_back(r);
-    }
-  }
-  for (const MethodResult& r : meanResults(all)) show(r);
-  if (scenes.count < 2) return;
-  for (const MethodResult& r : deviationResults(all)) show(r);
-}
-
-// RANK of WORLD_SIZE processes that meet at MASTER_ADDR:MASTER_PORT, the variables that torchrun
-// sets.
-TrainProcesses processes() {
-  TrainProcesses p;
-  auto number = [](const char* name, int high, auto* value) {
-    const char* text = std::getenv(name);
-    if (!text) return;
-    int used = 0, found = 0;
-    if (std::sscanf(text, "%d%n", &found, &used) != 1 || text[used] != '\0' || found < 0 ||
-        found > high)
-      throw UsageError(joinText(name, ": expected a number from 0 to ", high, ", found ", text));
-    *value = std::decay_t<decltype(*value)>(found);
-  };
-  number("WORLD_SIZE", 4096, &p.size), number("RANK", 4095, &p.rank),
-      number("MASTER_PORT", 65535, &p.port);
-  if (const char* address = std::getenv("MASTER_ADDR")) p.address = address;
-  if (p.rank >= std::max(1, p.size))
-    throw UsageError(joinText("RANK: expected less than WORLD_SIZE ", p.size, ", found ", p.rank));
-  p.size = std::max(1, p.size);
-  return p;
-}
-
-void cookReconstruct(const Evaluate& o, const Complete& options, const Common& common,
-                     Progress& progress) {
-  const SceneList scenes = sceneList(o.scenes, o.views, frameList(o.frames), common.seed);
-  const Encoder encoder(weightsFolder(o.weights) + "/encoder.safetensors");
-  const SceneSettings settings = sceneSettings(options, common, Eigen::Vector3d::UnitZ());
-  std::vector<ReconstructionResult> all;
-  auto show = [&](const ReconstructionResult& r) {
-    if (common.json) {
-      std::printf("%s\n", reconstructionJson(r).c_str());
-    } else {
-      std::printf(
-          "%-14s %-14s input: psnr %6.2f  ssim %.3f  flip %.3f  others: psnr %6.2f  ssim %.3f  "
-          "flip %.3f  voxels: precision %.3f  recall %.3f  f1 %.3f  leak %.3f  %6.2f + %.2f s  "
-          "%5.0f MB  %lld\n",
-          r.scene.c_str(), r.method.c_str(), r.input_psnr, r.input_ssim, r.input_flip, r.other_psnr,
-          r.other_ssim, r.other_flip, r.voxel_precision, r.voxel_recall, r.voxel_f1, r.leak,
-          r.encode_seconds, r.decode_seconds, r.peak_rss_mb, static_cast<long long>(r.gaussians));
-    }
-    std::fflush(stdout);
-  };
-  for (int64_t i = 0; i < scenes.count; ++i) {
-    const EvaluationScene scene = scenes.scene(i);
-    const std::string picture = pictureOf(o, i);
-    for (const ReconstructionResult& r : naming(scene.name, [&] {
-           return evaluateReconstruction(scene, encoder, settings, o.optimise_seconds, picture,
-                                         progress);
-         })) {
-      show(r);
-      all.push_back(r);
-    }
-  }
-  for (const ReconstructionResult& r : meanReconstructions(all)) show(r);
-}
-
-TrainSettings trainSettings(const Train& t, const Common& common) {
-  if (fs::path(t.output).extension() != ".safetensors")
-    throw UsageError(
-        joinText("--output: ", t.output, ": expected a name that ends in .safetensors"));
-  requireCreatable(t.output);
-  TrainSettings s;
-  s.weights_path = t.output;
-  s.work_folder = t.work.empty() ? t.output + ".work" : t.work;
-  s.batch = t.batch, s.processes = processes(), s.mixed_precision = t.mixed_precision;
-  if (s.batch % s.processes.size != 0)
-    throw UsageError(joinText("--batch: expected a multiple of WORLD_SIZE ", s.processes.size,
-                              ", found ", s.batch));
-  s.steps = t.steps, s.learning_rate = t.rate, s.seed = common.seed, s.resume = t.resume,
-  s.from = t.from;
-  s.validate_every = std::clamp<int64_t>(t.steps / 8, 1, s.validate_every);
-  return s;
-}
-
-TrainListener trainListener(bool json) {
-  return [json](const TrainLogRow& row) {
-    nlohmann::json j = row.values;
-    j["step"] = row.step;
-    if (json) {
-      std::printf("%s\n", j.dump().c_str());
-    } else {
-      std::printf("step %lld", static_cast<long long>(row.step));
-      for (const auto& [name, value] : row.values) std::printf("  %s %.4g", name.c_str(), value);
-      std::printf("\n");
-    }
-    std::fflush(stdout);
-  };
-}
-
-// The preset's configuration with --set NAME=VALUE applied.
-template <typename Config>
-Config configOf(const Train& t) {
-  ordered_json j =
-      ordered_json::parse((t.preset == "paper" ? Config::paper() : Config::small()).toJson());
-  for (const std::string& change : t.changes) {
-    const size_t equals = change.find('=');
-    const std::string name = change.substr(0, equals);
-    if (equals == std::string::npos || !j.contains(name))
-      throw UsageError(joinText("--set: ", change, ": expected NAME=VALUE with one of ", j.dump()));
-    const ordered_json value = ordered_json::parse(change.substr(equals + 1), nullptr, false);
-    if (value.type() != j[name].type() && !(value.is_number() && j[name].is_number_float()))
-      throw UsageError(joinText("--set: ", change, ": expected a value like ", j[name].dump()));
-    j[name] = value;
-  }
-  try {
-    return Config::fromJson(j.dump(), "--set");
-  } catch (const Error& e) {
-    throw UsageError(e.what());
-  }
-}
-
-std::string seedRange(uint64_t first, int64_t count) {
-  return joinText("rooms:", first, "-", first + uint64_t(count) - 1);
-}
-
-void cookTrainEncoder(const Train& t, const Common& common, Progress& progress) {
-  constexpr int kValidationRooms = 12;
-  const EncoderConfig config = configOf<EncoderConfig>(t);
-  TrainSettings s = trainSettings(t, common);
-  s.metadata["trained_on"] = seedRange(kTrainingSeed, t.scenes);
-  s.metadata["validated_on"] = seedRange(kValidationSeed, kValidationRooms);
-  auto source = [&](uint64_t first) {
-    return [&t, first](uint64_t i) { return trainingViews(first + i, t.cache); };
-  };
-  trainEncoder(config, source(kTrainingSeed), t.scenes, source(kValidationSeed), kValidationRooms,
-               s, trainListener(common.json), progress);
-}
-
-void cookTrainMar(const Train& t, const Common& common, Progress& progress) {
-  constexpr int kValidationRooms = 8;
-  const Encoder encoder(t.encoder);
-  if (!t.from.empty()) Completer{t.from};  // refused now, not after the rooms are encoded
-  CompleterConfig config = configOf<CompleterConfig>(t);
-  config.latent_dim = encoder.config().latent_dim,
-  config.latent_groups = encoder.config().latent_groups;
-  TrainSettings s = trainSettings(t, common);
-  s.metadata["trained_on"] = seedRange(kTrainingSeed, t.scenes);
-  s.metadata["validated_on"] = seedRange(kValidationSeed, kValidationRooms);
-  s.metadata["encoder_hash"] = encoder.hash();
-  s.validate_every = 1000;  // roll-outs take seconds each
-  // Samples depend on the encoder: its hash names their folder.
-  const std::string samples = s.work_folder + "/samples_" + encoder.hash();
-  auto source = [&](uint64_t first, int64_t rooms) {
-    return [&, first, rooms](uint64_t i) {
-      return completionSample(encoder, first + i % uint64_t(rooms), int(i / uint64_t(rooms)),
-                              t.cache, samples);
-    };
-  };
-  const auto training = source(kTrainingSeed, t.scenes),
-             validation = source(kValidationSeed, kValidationRooms);
-  const int64_t count = t.scenes * kSamplesPerRoom;
-  progress.start("encode rooms");
-  for (int64_t i = 0; i < count; ++i) {
-    training(uint64_t(i));
-    report(progress, int(100 * i / count));
-  }
-  progress.end();
-  trainCompleter(config, encoder.colourWay(), training, count, validation, kValidationRooms, s,
-                 trainListener(common.json), progress);
-}
-
-// CLI::Range lets NaN pass.
-struct Between : CLI::Range {
-  Between(double low, double high) : Range(low, high) {
-    func_ = [low, high](std::string& text) {
-      double value = 0;
-      if (CLI::detail::lexical_cast(text, value) && value >= low && value <= high)
-        return std::string();
-      return joinText("expected ", low, " to ", high, ", found ", text);
-    };
-  }
-};
-
-void addCommon(CLI::App* app, Common* c) {
-  app->add_option("--seed", c->seed, "fixes every random choice")->capture_default_str();
-  app->add_option("--threads", c->threads, "worker threads, 0 = all cores")
-      ->envname("VDB_COMPLETE_THREADS")
-      ->check(CLI::Range(0, 1024))
-      ->capture_default_str();
-  app->add_flag("--json", c->json,
-                "results (stdout) and progress (stderr) as JSON, one object a line");
-}
-
-void addScale(CLI::App* app, double* scale) {
-  app->add_option("--scale", *scale, "metres per unit of an .npz [from its camera baseline]")
-      ->check(Between(1e-6, 1e6));
-}
-
-void addMargin(CLI::App* app, Complete* o) {
-  app->add_option("--margin", o->margin, "room around what was seen [m]")
-      ->check(Between(0, 100))
-      ->capture_default_str();
-}
-
-void addChildTau(CLI::App* app, double* child_tau) {
-  app->add_option("--child-tau", *child_tau,
-                  "a voxel of a kept token is kept above this probability")
-      ->check(Between(0, 1))
-      ->capture_default_str();
-}
-
 void addAntialias(CLI::App* app, bool* antialias) {
   app->add_flag("--antialias", *antialias,
                 "splats are for an opacity-compensated low pass; the files say so");
-}
-
-void addWeights(CLI::App* app, std::string* weights) {
-  app->add_option("--weights", *weights,
-                  "folder with encoder.safetensors and completer.safetensors");
 }
 
 // What the main job and encode take.
@@ -808,32 +425,6 @@ void addViews(CLI::App* app, Complete* o, const char* output) {
   app->add_option("--bounds", o->bounds, "x0 y0 z0 x1 y1 z1 to complete [seen and margin]")
       ->expected(6);
   addScale(app, &o->scale);
-}
-
-void addCompletion(CLI::App* app, Complete* o) {
-  addMargin(app, o);
-  app->add_option("--tau", o->tau, "a token is kept above this probability")
-      ->check(Between(0, 1))
-      ->capture_default_str();
-  app->add_option("--coarse-tau", o->coarse_tau, "the same for the coarse gate")
-      ->check(Between(0, 1))
-      ->capture_default_str();
-  app->add_option(
-         "--hole-tau", o->hole_tau,
-         "above this probability dropped tokens are taken back where they close a hole, 1 = none")
-      ->check(Between(0, 1))
-      ->capture_default_str();
-  addChildTau(app, &o->child_tau);
-  app->add_option("--sampling-steps", o->sampling_steps, "diffusion steps, 0 = the linear mean")
-      ->check(CLI::Range(0, 1000))
-      ->capture_default_str();
-  app->add_option("--temperature", o->temperature, "of the diffusion head")
-      ->check(Between(0, 10))
-      ->capture_default_str();
-  app->add_flag("--generated-context", o->generated_context,
-                "generated tokens are context of later levels, as in the paper");
-  app->add_flag("--refine-observed", o->refine_observed,
-                "let the completer rewrite observed latents");
 }
 
 // Completing a part, again, or several times.
@@ -902,83 +493,6 @@ void addRender(CLI::App* verb, Render* o) {
       ->required();
 }
 
-void addEvaluate(CLI::App* verb, Evaluate* o, Complete* options) {
-  constexpr int kReconstructionViews = 12;
-  verb->add_option("--scenes", o->scenes, "rooms:SEED-SEED, or a folder with transforms.json")
-      ->required();
-  auto* views = verb->add_option("--views", o->views,
-                                 joinText("input views a scene [", o->views, "; ",
-                                          kReconstructionViews, " with --reconstruct]"))
-                    ->check(CLI::Range(1, 1000));
-  verb->add_option("--frames", o->frames, "input frames of a folder [--views random ones]");
-  addWeights(verb, &o->weights);
-  verb->add_option("--lpips", o->lpips, "your TorchScript network of two pictures [none]");
-  verb->add_option("--features", o->features,
-                   "your TorchScript network of one picture, for FID and KID [none]");
-  addCompletion(verb, options);
-  verb->add_option("--taus", o->taus, "also completed with each of these --tau")
-      ->check(Between(0, 1));
-  verb->add_option("--context-tokens", o->context_tokens,
-                   "observed tokens around a chunk [as trained]")
-      ->check(CLI::Range(1, 1 << 20));
-  verb->add_option("--chunk-tokens", o->chunk_tokens, "targets of a chunk [as trained]")
-      ->check(CLI::Range(1, 1 << 20));
-  verb->add_flag("--random-order", o->random_order,
-                 "growth in random instead of breadth-first order");
-  auto* reconstruct =
-      verb->add_flag("--reconstruct", o->reconstruct,
-                     "no completion: what was observed, encoded and decoded, beside baselines");
-  for (const char* of_completion :
-       {"--lpips", "--features", "--tau", "--coarse-tau", "--hole-tau", "--sampling-steps",
-        "--temperature", "--generated-context", "--refine-observed", "--taus", "--random-order",
-        "--context-tokens", "--chunk-tokens"})
-    reconstruct->excludes(verb->get_option(of_completion));
-  verb->add_option("--optimise", o->optimise_seconds,
-                   "seconds a scene for the baseline of optimised Gaussians, 0 leaves it out")
-      ->check(Between(0, 86400))
-      ->capture_default_str()
-      ->needs(reconstruct);
-  verb->add_option("--pictures", o->pictures,
-                   "folder for N.png of scene N; columns: truth, observed, nearest, box, "
-                   "completed, oracle occupancy "
-                   "(--reconstruct: truth, reconstruction, baselines) [none]");
-  verb->callback([=] {
-    if (o->reconstruct && !views->count()) o->views = kReconstructionViews;
-  });
-}
-
-void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rate) {
-  verb->add_option("-o,--output", t->output, "weights to write (.safetensors)")->required();
-  verb->add_option("--work", t->work, "folder for checkpoint, log and pictures [OUTPUT.work]");
-  verb->add_option(
-      "--cache", t->cache,
-      "folder of rooms from make_rooms; missing ones are put there [render each time]");
-  verb->add_option("--preset", t->preset, "small or paper")
-      ->check(CLI::IsMember({"small", "paper"}))
-      ->capture_default_str();
-  verb->add_option("--set", t->changes,
-                   "NAME=VALUE, changes a size of the preset (several allowed)")
-      ->allow_extra_args(false);
-  verb->add_option("--batch", t->batch, "samples a step")
-      ->check(CLI::Range(int64_t(1), int64_t(1) << 20))
-      ->capture_default_str();
-  auto* s = verb->add_option("--steps", t->steps, joinText("training steps [", steps, "]"))
-                ->check(CLI::Range(int64_t(1), int64_t(1) << 40));
-  auto* n =
-      verb->add_option("--rooms", t->scenes, joinText("furnished rooms to train on [", rooms, "]"))
-          ->check(CLI::Range(int64_t(1), int64_t(kReservedSeeds)));
-  auto* r = verb->add_option("--rate", t->rate, joinText("peak learning rate [", rate, "]"))
-                ->check(Between(0, 1));
-  verb->add_flag("--mixed-precision", t->mixed_precision,
-                 "matrix products in bfloat16: faster where the CPU has it");
-  verb->add_flag("--resume", t->resume, "continue from the checkpoint in the work folder");
-  verb->callback([=] {
-    if (!s->count()) t->steps = steps;
-    if (!n->count()) t->scenes = rooms;
-    if (!r->count()) t->rate = rate;
-  });
-}
-
 int run(int argc, char** argv) {
   CLI::App app{
       "Completes a place seen in a few RGB-D views as OpenVDB grids and 3-D Gaussians.\n"
@@ -987,13 +501,11 @@ int run(int argc, char** argv) {
       "vdb_complete"};
   app.set_version_flag("--version", VDBC_VERSION);
   Common common;
-  Complete complete, encode, eval_options;
+  Complete complete, encode;
   Decode decode;
   Rethreshold rethreshold;
   Render render;
   Check check;
-  Evaluate evaluate;
-  Train train;
   app.require_subcommand(0, 1);
 
   addCommon(&app, &common);
@@ -1038,20 +550,7 @@ int run(int argc, char** argv) {
   verb_check->add_option("VOLUME", check.volume, "X.vdb")->required();
   verb_check->add_option("--frames", check.frames, "which of the views [all]");
   addScale(verb_check, &check.scale);
-  CLI::App* verb_eval =
-      app.add_subcommand("eval", "compares all methods on scenes that were never trained on");
-  addEvaluate(verb_eval, &evaluate, &eval_options);
-  CLI::App* verb_train = app.add_subcommand("train", "trains a network on furnished rooms");
-  verb_train->require_subcommand(1);
-  CLI::App* train_encoder = verb_train->add_subcommand("encoder", "the encoder-decoder");
-  addTrain(train_encoder, &train, 4000, 1000, 1e-3);
-  CLI::App* train_mar = verb_train->add_subcommand("mar", "the masked auto-regressive completer");
-  addTrain(train_mar, &train, 8000, 400, 8e-4);
-  train_mar->add_option("--encoder", train.encoder, "encoder weights")->required();
-  train_mar->add_option("--from", train.from, "completer weights to start from [random]")
-      ->excludes(train_mar->get_option("--resume"));
-  for (CLI::App* verb : {info, verb_encode, verb_decode, verb_rethreshold, verb_render, verb_check,
-                         verb_eval, train_encoder, train_mar})
+  for (CLI::App* verb : {info, verb_encode, verb_decode, verb_rethreshold, verb_render, verb_check})
     addCommon(verb, &common);
 
   try {
@@ -1060,8 +559,7 @@ int run(int argc, char** argv) {
     if (e.get_exit_code() == 0) return app.exit(e);  // --help, --version
     throw UsageError(joinText(e.what(), " (vdb_complete --help)"));
   }
-  const int threads =
-      common.threads ? common.threads : int(std::max(1u, std::thread::hardware_concurrency()));
+  const int threads = threadCount(common);
   const tbb::global_control limit(tbb::global_control::max_allowed_parallelism, size_t(threads));
   at::set_num_threads(threads);
   Console console(common.json);
@@ -1077,13 +575,6 @@ int run(int argc, char** argv) {
     cookRender(render, common, console);
   } else if (verb_check->parsed()) {
     cookCheck(check, common);
-  } else if (verb_eval->parsed()) {
-    (evaluate.reconstruct ? cookReconstruct : cookEvaluate)(evaluate, eval_options, common,
-                                                            console);
-  } else if (train_encoder->parsed()) {
-    cookTrainEncoder(train, common, console);
-  } else if (train_mar->parsed()) {
-    cookTrainMar(train, common, console);
   } else if (complete.views.empty() || complete.output.empty()) {
     throw UsageError("expected VIEWS and -o X.vdb, or a verb (vdb_complete --help)");
   } else {
@@ -1095,23 +586,4 @@ int run(int argc, char** argv) {
 }  // namespace
 }  // namespace vdbc
 
-int main(int argc, char** argv) {
-  vdbc::chooseBlasCore();
-  // Tensors of some megabytes come and go: keep their pages instead of asking the kernel each time.
-  mallopt(M_MMAP_THRESHOLD, 1 << 30);
-  mallopt(M_TRIM_THRESHOLD, 1 << 30);
-  try {
-    const int code = vdbc::run(argc, argv);
-    vdbc::require(std::fflush(stdout) == 0, "standard output: cannot write the results");
-    return code;
-  } catch (const vdbc::Cancelled&) {
-    std::fprintf(stderr, "vdb_complete: interrupted\n");
-    return 130;
-  } catch (const vdbc::UsageError& e) {
-    std::fprintf(stderr, "vdb_complete: %s\n", e.what());
-    return 2;
-  } catch (const std::exception& e) {
-    std::fprintf(stderr, "vdb_complete: %s\n", vdbc::firstLine(e).c_str());
-    return 1;
-  }
-}
+int main(int argc, char** argv) { return vdbc::runProgram("vdb_complete", vdbc::run, argc, argv); }

@@ -1,10 +1,12 @@
-# Who includes whom (docs/architecture.md): vdb <- splat <- encoder <- mar <- houdini_style_tools, only
-# leftwards; vdb and splat know no torch, nothing includes all of torch.
+# Who includes whom (docs/architecture.md): vdb <- splat <- encoder <- mar <- houdini_style_tools <- examples/lab,
+# only leftwards; examples/rooms stands on vdb, splat and encoder/views, and only the lab includes it; vdb, splat,
+# encoder/views and examples/rooms know no torch, nothing includes all of torch.
 #   cmake -DROOT=<repository> -P include_order_test.cmake       checks the sources
 #   cmake -DSELF_TEST=<scratch> -P include_order_test.cmake     checks that the check finds violations
 cmake_minimum_required(VERSION 3.25)
 
-set(ORDER vdb splat examples/rooms encoder mar houdini_style_tools)
+# A folder includes itself and what comes before it.
+set(ORDER vdb splat encoder/views examples/rooms encoder mar houdini_style_tools examples/lab)
 
 # All violations under `root`, one line each, in the variable `out`.
 function(find_violations root out)
@@ -15,7 +17,7 @@ function(find_violations root out)
     foreach(file ${files})
       file(RELATIVE_PATH name ${root} ${file})
       set(torch_free FALSE)
-      if(folder MATCHES "^(vdb|splat|examples/rooms)$" AND NOT name MATCHES "^splat/rasterize_torch\\.")
+      if(folder MATCHES "^(vdb|splat|encoder/views|examples/rooms)$" AND NOT name MATCHES "^splat/rasterize_torch\\.")
         set(torch_free TRUE)
       endif()
       file(STRINGS ${file} lines REGEX "^[ \t]*#[ \t]*include")
@@ -31,8 +33,8 @@ function(find_violations root out)
           list(APPEND found "${name}: ${header} (3 s for everyone: take openvdb/Types.h or one grid)")
         elseif(folder STREQUAL "mar" AND header MATCHES "^encoder/(encoder|network|encoder_train)\\.h$")
           list(APPEND found "${name}: ${header} (the pipelines meet in houdini_style_tools only)")
-        elseif(folder MATCHES "^(encoder|mar)$" AND header MATCHES "^examples/")
-          list(APPEND found "${name}: ${header} (libraries know nothing of the examples)")
+        elseif(folder MATCHES "^(encoder|mar|houdini_style_tools)$" AND header MATCHES "^examples/rooms/")
+          list(APPEND found "${name}: ${header} (only the lab knows the rooms)")
         elseif(own GREATER -1)
           get_filename_component(other ${header} DIRECTORY)
           list(FIND ORDER "${other}" rank)
@@ -49,13 +51,15 @@ endfunction()
 if(SELF_TEST)
   set(bad "vdb/a.h|splat/image.h" "vdb/a.cpp|ATen/ATen.h" "splat/a.cpp|torch/types.h"
     "splat/a.cpp|splat/rasterize_torch.h" "splat/a.h|encoder/layers.h" "encoder/a.cpp|mar/heads.h"
-    "mar/a.cpp|encoder/network.h" "mar/a.cpp|examples/rooms/rooms.h" "mar/a.h|torch/torch.h"
+    "mar/a.cpp|encoder/network.h" "mar/a.cpp|examples/rooms/rooms.h" "houdini_style_tools/a.cpp|examples/rooms/rooms.h"
+    "houdini_style_tools/a.cpp|examples/lab/evaluate.h" "examples/rooms/a.cpp|examples/lab/scenes.h" "mar/a.h|torch/torch.h"
     "tests/a_test.cpp|torch/torch.h" "examples/rooms/rooms.h|encoder/encoder.h"
-    "encoder/a.h|houdini_style_tools/blas.h" "splat/a.h|openvdb/openvdb.h")
+    "encoder/a.h|houdini_style_tools/blas.h" "encoder/views/a.cpp|encoder/encoder.h" "splat/a.cpp|encoder/views/view.h"
+    "splat/a.h|openvdb/openvdb.h")
   set(good "vdb/a.h|vdb/error.h" "splat/a.cpp|vdb/camera.h" "splat/rasterize_torch.cpp|ATen/ATen.h"
     "encoder/a.cpp|splat/rasterize_torch.h" "mar/a.cpp|encoder/layers.h" "vdb/a.cpp|openvdb/openvdb.h"
-    "houdini_style_tools/a.cpp|examples/rooms/rooms.h" "tests/a_test.cpp|mar/heads.h"
-    "examples/rooms/a.cpp|splat/view.h")
+    "examples/lab/a.cpp|examples/rooms/rooms.h" "examples/lab/a.cpp|houdini_style_tools/complete.h" "tests/a_test.cpp|mar/heads.h"
+    "examples/rooms/a.cpp|encoder/views/view.h" "encoder/a.h|encoder/views/view.h")
   foreach(case ${bad} ${good})
     string(REPLACE "|" ";" parts "${case}")
     list(GET parts 0 file)

@@ -1,4 +1,4 @@
-#include "houdini_style_tools/perceptual.h"
+#include "examples/lab/perceptual.h"
 
 #include <gtest/gtest.h>
 #include <torch/csrc/jit/api/module.h>

@@ -75,7 +75,13 @@ struct Ended {
   std::string out, err;
 };
 
-// A scratch folder with small inputs, and the program to run on them.
+// The program that has the arguments' verb.
+std::string programOf(const Args& args) {
+  const bool of_lab = !args.empty() && (args[0] == "eval" || args[0] == "train");
+  return of_lab ? VDBC_LAB : VDBC_PROGRAM;
+}
+
+// A scratch folder with small inputs, and the programs to run on them.
 class Program : public ::testing::Test {
  protected:
   void SetUp() override {
@@ -92,7 +98,7 @@ class Program : public ::testing::Test {
 
   std::string at(const std::string& name) const { return root_ + "/" + name; }
 
-  // Starts the program; with `signal_at`, sends SIGINT once that stage has begun (needs --json) and
+  // Starts a program; with `signal_at`, sends SIGINT once that stage has begun (needs --json) and
   // that file is there.
   Ended run(const Args& args, const std::string& signal_at = "",
             const std::string& file = "") const {
@@ -103,17 +109,18 @@ class Program : public ::testing::Test {
     posix_spawn_file_actions_addopen(&actions, 0, "/dev/null", O_RDONLY, 0);
     posix_spawn_file_actions_addopen(&actions, 1, out.c_str(), flags, 0600);
     posix_spawn_file_actions_addopen(&actions, 2, err.c_str(), flags, 0600);
-    std::vector<char*> argv = {const_cast<char*>(VDBC_PROGRAM)};
+    const std::string program = programOf(args);
+    std::vector<char*> argv = {const_cast<char*>(program.c_str())};
     for (const std::string& a : args) argv.push_back(const_cast<char*>(a.c_str()));
     argv.push_back(nullptr);
     // Tests run side by side: more threads than cores would only wait for each other.
     setenv("VDB_COMPLETE_THREADS", "1", 1);
     writeText(err, "");
     pid_t pid = 0;
-    const int failure = posix_spawn(&pid, VDBC_PROGRAM, &actions, nullptr, argv.data(), environ);
+    const int failure = posix_spawn(&pid, program.c_str(), &actions, nullptr, argv.data(), environ);
     posix_spawn_file_actions_destroy(&actions);
     Ended ended;
-    EXPECT_EQ(failure, 0) << "cannot start " << VDBC_PROGRAM;
+    EXPECT_EQ(failure, 0) << "cannot start " << program;
     if (failure) return ended;
     int status = 0;
     if (!signal_at.empty()) {
@@ -137,13 +144,14 @@ class Program : public ::testing::Test {
   void expectFailure(const Args& args, int code, const std::string& named) const {
     std::string command;
     for (const std::string& a : args) command += " " + a;
-    SCOPED_TRACE("vdb_complete" + command);
+    const std::string program = fs::path(programOf(args)).filename().string();
+    SCOPED_TRACE(program + command);
     const Args before = listing(output_);
     const Ended ended = run(args);
     EXPECT_EQ(ended.code, code);
     EXPECT_EQ(ended.out, "");
     EXPECT_EQ(std::count(ended.err.begin(), ended.err.end(), '\n'), 1) << ended.err;
-    EXPECT_EQ(ended.err.rfind("vdb_complete: ", 0), 0u) << ended.err;
+    EXPECT_EQ(ended.err.rfind(program + ": ", 0), 0u) << ended.err;
     EXPECT_NE(ended.err.find(named), std::string::npos)
         << ended.err << "expected to name: " << named;
     EXPECT_EQ(listing(output_), before);
@@ -258,8 +266,8 @@ TEST_F(Program, FramesOutOfRangeNameTheViews) {
 
 TEST_F(Program, HelpOfEveryVerbListsTheCommonOptions) {
   const std::vector<Args> verbs = {
-      {},        {"info"}, {"encode"},           {"decode"},      {"render"},
-      {"check"}, {"eval"}, {"train", "encoder"}, {"train", "mar"}};
+      {},         {"info"},  {"encode"}, {"decode"},           {"rethreshold"},
+      {"render"}, {"check"}, {"eval"},   {"train", "encoder"}, {"train", "mar"}};
   for (Args args : verbs) {
     args.push_back("--help");
     SCOPED_TRACE(testing::PrintToString(args));
@@ -270,7 +278,7 @@ TEST_F(Program, HelpOfEveryVerbListsTheCommonOptions) {
       EXPECT_NE(ended.out.find(option), std::string::npos) << option;
     if (args.size() > 1) continue;
     for (const Args& verb : verbs)  // the front page lists them all
-      if (!verb.empty()) {
+      if (!verb.empty() && programOf(verb) == VDBC_PROGRAM) {
         EXPECT_NE(ended.out.find("\n  " + verb[0] + " "), std::string::npos) << verb[0];
       }
   }

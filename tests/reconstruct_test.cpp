@@ -1,5 +1,5 @@
 // The baselines of the evaluations, and what counts there.
-#include "houdini_style_tools/reconstruct.h"
+#include "examples/lab/reconstruct.h"
 
 #include <gtest/gtest.h>
 

@@ -5,7 +5,7 @@
 #include <string>
 #include <vector>
 
-#include "houdini_style_tools/evaluate.h"
+#include "examples/lab/evaluate.h"
 
 namespace vdbc {
 

@@ -1,4 +1,4 @@
-#include "houdini_style_tools/scenes.h"
+#include "examples/lab/scenes.h"
 
 #include <algorithm>
 #include <filesystem>

@@ -3,15 +3,11 @@
 // `gaussians` and numbers; one list of a result's numbers serves JSON, means and deviations.
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
-#include <fstream>
 #include <limits>
 #include <nlohmann/json.hpp>
 #include <numeric>
 #include <string>
 #include <vector>
-
-#include "vdb/progress.h"
 
 namespace vdbc {
 
@@ -75,15 +71,6 @@ std::vector<Result> summaries(const std::vector<Result>& results,
     all.push_back(one);
   }
   return all;
-}
-
-// The kernel keeps the peak; writing 5 to clear_refs starts it afresh (Linux).
-inline void resetPeakMemory() { std::ofstream("/proc/self/clear_refs") << "5"; }
-inline double peakMemoryMb() {
-  std::ifstream status("/proc/self/status");
-  for (std::string line; std::getline(status, line);)
-    if (line.rfind("VmHWM:", 0) == 0) return std::atof(line.c_str() + 6) / 1024;
-  return kNan;
 }
 
 }  // namespace vdbc

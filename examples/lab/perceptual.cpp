@@ -1,4 +1,4 @@
-#include "houdini_style_tools/perceptual.h"
+#include "examples/lab/perceptual.h"
 
 #include <ATen/ops/empty.h>
 #include <torch/csrc/jit/serialization/import.h>

@@ -1,4 +1,4 @@
-#include "houdini_style_tools/evaluate.h"
+#include "examples/lab/evaluate.h"
 
 #include <algorithm>
 #include <chrono>
@@ -7,11 +7,13 @@
 #include <numeric>
 #include <random>
 
+#include "examples/lab/scenes.h"
+#include "examples/lab/scores.h"
 #include "examples/rooms/rooms.h"
-#include "houdini_style_tools/scenes.h"
-#include "houdini_style_tools/scores.h"
 #include "splat/metrics.h"
 #include "splat/rasterize.h"
+#include "vdb/process.h"
+#include "vdb/progress.h"
 
 namespace vdbc {
 namespace {

@@ -1,4 +1,4 @@
-#include "houdini_style_tools/reconstruct.h"
+#include "examples/lab/reconstruct.h"
 
 #include <torch/optim/adam.h>
 
@@ -9,11 +9,13 @@
 #include <random>
 
 #include "encoder/network.h"
+#include "examples/lab/scores.h"
 #include "examples/rooms/rooms.h"
-#include "houdini_style_tools/scores.h"
 #include "splat/metrics.h"
 #include "splat/rasterize.h"
 #include "splat/rasterize_torch.h"
+#include "vdb/process.h"
+#include "vdb/progress.h"
 
 namespace vdbc {
 namespace {

@@ -9,8 +9,8 @@
 #include <string>
 #include <vector>
 
+#include "examples/lab/perceptual.h"
 #include "houdini_style_tools/complete.h"
-#include "houdini_style_tools/perceptual.h"
 #include "splat/embree_check.h"
 
 namespace vdbc {
