@@ -1,71 +1,11 @@
 #include "encoder/encoder.h"
 
 #include <cmath>
-#include <nlohmann/json.hpp>
 
 #include "encoder/network.h"
 #include "encoder/weights.h"
 
 namespace vdbc {
-
-using nlohmann::json;
-
-EncoderConfig EncoderConfig::paper() {
-  EncoderConfig c;
-  c.preset = "paper";
-  c.voxel_width = 256, c.width = 512, c.heads = 16;
-  c.blocks = 6, c.decoder_blocks = 6, c.window = 1024;
-  c.latent_dim = 32, c.latent_groups = 8;
-  c.kl_weight = .1f;
-  c.gaussians_per_voxel = 216;
-  return c;
-}
-
-namespace {
-// One list of the fields serves writing and reading.
-template <typename Config, typename Visit>
-void visitFields(Config& c, Visit&& visit) {
-  visit("preset", c.preset), visit("voxel_m", c.voxel_m), visit("levels", c.levels);
-  visit("patches_across", c.patches_across), visit("patch_px", c.patch_px);
-  visit("voxel_width", c.voxel_width), visit("width", c.width), visit("heads", c.heads);
-  visit("blocks", c.blocks), visit("decoder_blocks", c.decoder_blocks), visit("window", c.window);
-  visit("latent_dim", c.latent_dim), visit("latent_groups", c.latent_groups);
-  visit("kl_weight", c.kl_weight), visit("occupancy_weight", c.occupancy_weight);
-  visit("gaussians_per_voxel", c.gaussians_per_voxel), visit("guide_alpha", c.guide_alpha);
-  visit("guide_log_counts", c.guide_log_counts), visit("false_positives", c.false_positives);
-}
-}  // namespace
-
-std::string EncoderConfig::toJson() const {
-  json j;
-  visitFields(*this, [&](const char* name, const auto& value) { j[name] = value; });
-  return j.dump();
-}
-
-EncoderConfig EncoderConfig::fromJson(const std::string& text, const std::string& where) {
-  EncoderConfig c;
-  try {
-    const json j = json::parse(text);
-    visitFields(c, [&](const char* name, auto& value) { j.at(name).get_to(value); });
-  } catch (const json::exception& e) {
-    throw Error(joinText("EncoderConfig: ", where, ": bad configuration: ", e.what()));
-  }
-  auto within = [&](const char* name, int value, int low, int high) {
-    require(value >= low && value <= high, "EncoderConfig: ", where, ": expected ", name, " in [",
-            low, ", ", high, "], found ", value);
-  };
-  within("levels", c.levels, 0, 2), within("patches_across", c.patches_across, 1, 256);
-  within("patch_px", c.patch_px, 1, 64), within("voxel_width", c.voxel_width, 1, 4096);
-  within("width", c.width, 1, 4096), within("heads", c.heads, 1, 64);
-  within("blocks", c.blocks, 1, 64), within("decoder_blocks", c.decoder_blocks, 0, 64);
-  within("window", c.window, 2, 1 << 16), within("latent_dim", c.latent_dim, 1, 1024);
-  within("latent_groups", c.latent_groups, 0, c.latent_dim);
-  within("gaussians_per_voxel", c.gaussians_per_voxel, 1, 512);
-  require(c.width % (2 * c.heads) == 0 &&
-              (c.latent_groups == 0 || c.latent_dim % c.latent_groups == 0) && c.voxel_m > 0,
-          "EncoderConfig: ", where, ": width, heads, groups or voxel size do not fit each other");
-  return c;
-}
 
 struct Encoder::Impl {
   std::shared_ptr<EncoderNet> net;
@@ -179,13 +119,7 @@ DecodedGrid Encoder::decode(const Place& place, float child_threshold, Progress&
     const auto chance = p.accessor<float, 2>();
     openvdb::tree::ValueAccessor<const TokenMask> filled(place.seen->filled),
         empty(place.seen->empty);
-    const int side = 1 << (c.levels - 1 - split);  // of a child, in voxels
-    auto activeBelow = [&](const auto& mask, const Coord& child) {
-      int active = 0;
-      for (int v = 0; v < side * side * side; ++v)
-        active += mask.isValueOn(voxelOf(child, side, v));
-      return active;
-    };
+    const int child_level = c.levels - 1 - split;
     Children kept;
     for (size_t i = 0; i < coords.size(); ++i) {
       int likeliest = -1;
@@ -198,11 +132,11 @@ DecodedGrid Encoder::decode(const Place& place, float child_threshold, Progress&
       };
       for (int slot = 0; slot < 8; ++slot) {
         const Coord child = childCoord(coords[i], slot);
-        if (activeBelow(filled, child) > 0) {
+        if (anyVoxelOn(filled, child, child_level)) {
           keep(slot, 1.f);
           continue;
         }
-        if (activeBelow(empty, child) == side * side * side) continue;  // seen empty: stays empty
+        if (allVoxelsOn(empty, child, child_level)) continue;  // seen empty: stays empty
         const float q = chance[int64_t(i)][slot];
         if (q > child_threshold) keep(slot, q);
         if (likeliest < 0 || q > chance[int64_t(i)][likeliest]) likeliest = slot;

@@ -53,15 +53,12 @@ std::pair<Tensor, Tensor> childTruth(const std::vector<Coord>& coords, int level
   bool* t = truth.data_ptr<bool>();
   bool* k = known.data_ptr<bool>();
   openvdb::tree::ValueAccessor<const TokenMask> empty(o.seen->empty);
-  const int side = 1 << (level - 1);
   for (const Coord& parent : coords)
     for (int slot = 0; slot < 8; ++slot, ++t, ++k) {
       const Coord child = childCoord(parent, slot);
       *t = *k = o.tokens.row(level - 1, child) >= 0;
       if (*t) continue;
-      *k = true;
-      for (int v = 0; v < side * side * side && *k; ++v)
-        *k = empty.isValueOn(voxelOf(child, side, v));
+      *k = allVoxelsOn(empty, child, level - 1);
     }
   return {truth, known};
 }

@@ -43,13 +43,14 @@ Tensor zOrder(const std::vector<Coord>& coords) {
   return order;
 }
 
-Rotary rotary(const Tensor& coords, int head_dim) {
+Rotary rotary(const Tensor& coords, int head_dim, const PositionConfig& config) {
   constexpr int kFrequencies = 5;
   const int64_t n = coords.size(0), pairs = head_dim / 2;
   const int used = int(std::min<int64_t>(kFrequencies, pairs / 3));
-  std::vector<float> f(size_t(used), 1.5f);
+  const float high = config.rotary_highest, low = config.rotary_lowest;
+  std::vector<float> f(size_t(used), high);
   for (int i = 1; i < used; ++i)
-    f[size_t(i)] = 1.5f * std::pow(.094f / 1.5f, float(i) / float(used - 1));
+    f[size_t(i)] = high * std::pow(low / high, float(i) / float(used - 1));
   const Tensor frequencies = torch::tensor(f);
   Tensor angle = coords.to(torch::kFloat32).unsqueeze(2) * frequencies;  // [N, 3, used]
   angle = torch::cat({angle.reshape({n, 3 * used}), torch::zeros({n, pairs - 3 * used})}, 1);
@@ -68,19 +69,21 @@ Tensor sinusoidalCode(const Tensor& positions) {
   return torch::cat({angle.sin(), angle.cos()}, 1);
 }
 
-Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame) {
+Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame,
+                           const PositionConfig& config) {
   constexpr float kExtent =
       12.8f;  // metres; larger places go beyond +-.5 and the code still differs
   const Coord lo = frame.bounds.min(), hi = frame.bounds.max();
   const Tensor origin = torch::tensor({float(lo.x() + hi.x() + 1) / 2 * frame.voxel_m,
                                        float(lo.y() + hi.y() + 1) / 2 * frame.voxel_m,
                                        float(lo.z()) * frame.voxel_m});
-  return (metres - origin) / kExtent;
+  return (metres - origin) / config.extent_m;
 }
 
-Tensor tokenPositions(const Tensor& coords, int level, const VoxelFrame& frame) {
+Tensor tokenPositions(const Tensor& coords, int level, const VoxelFrame& frame,
+                      const PositionConfig& config) {
   const float token_m = frame.voxel_m * float(1 << level);
-  return normalisedPositions((coords.to(torch::kFloat32) + .5f) * token_m, frame);
+  return normalisedPositions((coords.to(torch::kFloat32) + .5f) * token_m, frame, config);
 }
 
 namespace {

@@ -9,7 +9,8 @@
 #include <torch/nn/modules/normalization.h>
 #include <torch/types.h>
 
-#include "vdb/carve.h"
+#include "encoder/positions.h"
+#include "vdb/frame.h"
 #include "vdb/token_grid.h"
 
 namespace vdbc {
@@ -23,15 +24,15 @@ Tensor coordTensor(const std::vector<Coord>& coords);
 /// neighbours in space, which is what windowed attention needs.
 Tensor zOrder(const std::vector<Coord>& coords);
 
-/// Cosines and sines of 3-D rotary positions, each [N, head_dim / 2]: 5 frequencies an axis, 1.5 to
-/// .094 rad a voxel, geometric; pairs left over do not turn. Spec A5.
+/// Cosines and sines of 3-D rotary positions, each [N, head_dim / 2]: 5 frequencies an axis between
+/// the configuration's, geometric; pairs left over do not turn.
 struct Rotary {
   Tensor cos, sin;
   Rotary select(const Tensor& rows) const {
     return {cos.index_select(0, rows), sin.index_select(0, rows)};
   }
 };
-Rotary rotary(const Tensor& coords, int head_dim);
+Rotary rotary(const Tensor& coords, int head_dim, const PositionConfig& config);
 
 /// Rotates [H, N, head_dim] by the positions of its N tokens.
 Tensor rotate(const Tensor& x, const Rotary& positions);
@@ -41,9 +42,11 @@ Tensor sinusoidalCode(const Tensor& positions);
 constexpr int kSinusoidalDim = 36;
 
 /// Positions in metres (grid axes) divided by the training extent: about -.5..+.5 across, 0-.4 up.
-Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame);
+Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame,
+                           const PositionConfig& config);
 /// The same of the centres of tokens [N, 3] int32 of a tree level.
-Tensor tokenPositions(const Tensor& coords, int level, const VoxelFrame& frame);
+Tensor tokenPositions(const Tensor& coords, int level, const VoxelFrame& frame,
+                      const PositionConfig& config);
 
 /// While it lives, this thread's Linear layers multiply in bfloat16, forward and backward; all
 /// else, the parameters too, stays float32.

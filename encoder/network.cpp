@@ -66,7 +66,8 @@ Tensor patchPixels(const std::vector<View>& views, const Observation& o, int px)
 
 // Where each patch looks from and to: centre ray 3, camera place 3 and mean point 3 (normalised),
 // share 1.
-Tensor patchGeometry(const std::vector<View>& views, const Observation& o) {
+Tensor patchGeometry(const std::vector<View>& views, const Observation& o,
+                     const PositionConfig& positions) {
   std::vector<float> rays;
   for (size_t i = 0; i < views.size(); ++i) {
     const PatchLattice& l = o.lattices[i];
@@ -87,8 +88,8 @@ Tensor patchGeometry(const std::vector<View>& views, const Observation& o) {
   const Tensor points = torch::tensor(o.patch_points).view({o.patches, 4});
   const Tensor share = points.slice(1, 3, 4);
   const Tensor seen = (share > 0).to(torch::kFloat32);
-  return torch::cat({r.slice(1, 0, 3), normalisedPositions(r.slice(1, 3, 6), o.frame),
-                     normalisedPositions(points.slice(1, 0, 3), o.frame) * seen, share},
+  return torch::cat({r.slice(1, 0, 3), normalisedPositions(r.slice(1, 3, 6), o.frame, positions),
+                     normalisedPositions(points.slice(1, 0, 3), o.frame, positions) * seen, share},
                     1);
 }
 
@@ -108,10 +109,10 @@ EncoderInput encoderInput(const std::vector<View>& views, const Observation& o,
   }
   const auto& coords = o.tokens.coords(config.levels);
   in.coords = coordTensor(coords);
-  in.positions = tokenPositions(in.coords, config.levels, o.frame);
+  in.positions = tokenPositions(in.coords, config.levels, o.frame, config.positions);
   in.order = zOrder(coords);
   in.patches = patchPixels(views, o, config.patch_px);
-  in.patch_geometry = patchGeometry(views, o);
+  in.patch_geometry = patchGeometry(views, o, config.positions);
 
   const int64_t tokens = in.coords.size(0);
   require(int64_t(o.row_begin.size()) == tokens + 1,
@@ -251,7 +252,7 @@ EncoderNet::Posterior EncoderNet::encode(const EncoderInput& in) {
                   torch::cat({in.patch_geometry, sinusoidalCode(in.patch_geometry.slice(1, 3, 6)),
                               sinusoidalCode(in.patch_geometry.slice(1, 6, 9))},
                              1));
-  const Rotary pos = rotary(in.coords, config.width / config.heads);
+  const Rotary pos = rotary(in.coords, config.width / config.heads, config.positions);
   for (size_t b = 0; b < blocks.size(); ++b) blocks[b]->forward(&x3, &x2, in, pos, int(b));
   const auto halves = posterior->forward(posterior_norm->forward(x3)).chunk(2, 1);
   const Tensor shallow = feature_shortcut->forward(torch::cat({pooled, octants.flatten(1)}, 1));
@@ -264,7 +265,7 @@ Tensor EncoderNet::normalise(const Tensor& z) {
 
 DecoderTokens EncoderNet::decodeTokens(const Tensor& z, const Tensor& coords, const Tensor& order) {
   Tensor x = latent_in->forward(z);
-  const Rotary pos = rotary(coords, config.width / config.heads);
+  const Rotary pos = rotary(coords, config.width / config.heads, config.positions);
   for (size_t b = 0; b < decoder_blocks.size(); ++b)
     x = decoder_blocks[b]->forward(x, &pos, order, config.window, b % 2 == 1);
   return {decoder_norm->forward(x), colour_shortcut->forward(z).view({-1, 8, 3})};

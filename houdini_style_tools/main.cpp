@@ -94,7 +94,6 @@ bool endsWith(const std::string& text, const std::string& ending) {
 
 // Latents that this encoder made, of a place that it could have seen.
 Place readLatents(const std::string& path, const Encoder& encoder, const std::string& weights) {
-  constexpr int64_t kMaxVoxels = int64_t(1) << 30;
   Place place = readLatentVdb(path);
   require(place.encoder_hash == encoder.hash(), path, ": expected the weights ", place.encoder_hash,
           " that made it, found ", encoder.hash(), " in ", weights, " (use --weights)");
@@ -105,11 +104,9 @@ Place readLatents(const std::string& path, const Encoder& encoder, const std::st
   bool whole = true;  // nodes of all levels
   for (int axis = 0; axis < 3; ++axis)
     whole = whole && frame.bounds.min()[axis] % 4 == 0 && size[axis] % 4 == 0;
-  require(frame.voxel_m == encoder.config().voxel_m && whole &&
-              int64_t(size.x()) * size.y() * size.z() <= kMaxVoxels,
-          path, ": expected voxels of ", encoder.config().voxel_m,
-          " m and a volume of whole nodes and at most ", kMaxVoxels, " voxels, found ",
-          frame.voxel_m, " m and ", frame.bounds);
+  require(frame.voxel_m == encoder.config().voxel_m && whole, path, ": expected voxels of ",
+          encoder.config().voxel_m, " m and a volume of whole nodes, found ", frame.voxel_m,
+          " m and ", frame.bounds);
   return place;
 }
 

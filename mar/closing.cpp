@@ -4,6 +4,10 @@
 #include <boost/graph/adjacency_list.hpp>
 #include <boost/graph/boykov_kolmogorov_max_flow.hpp>
 #include <cmath>
+#include <numeric>
+
+#include "vdb/frontier.h"
+#include "vdb/token_map.h"
 
 namespace vdbc {
 namespace {
@@ -14,12 +18,12 @@ struct Pipe {
   double capacity = 0, residual = 0;
   Edge reverse;
 };
-struct Place {
+struct Vertex {
   boost::default_color_type colour = boost::white_color;
   double distance = 0;
   Edge predecessor;
 };
-using Graph = boost::adjacency_list<boost::vecS, boost::vecS, boost::directedS, Place, Pipe>;
+using Graph = boost::adjacency_list<boost::vecS, boost::vecS, boost::directedS, Vertex, Pipe>;
 
 void connect(Graph& graph, size_t from, size_t to, double capacity) {
   const Edge there = boost::add_edge(from, to, graph).first,
@@ -28,71 +32,122 @@ void connect(Graph& graph, size_t from, size_t to, double capacity) {
   graph[here].reverse = there;
 }
 
-}  // namespace
+// What a node is to the cut. Pipes are dropped tokens: their way in is a vertex, the way out is the
+// next. Open nodes are those beside all others; they are vertices by region.
+enum Kind : int32_t { kSource = 0, kSink = 1, kSolid = -1, kOpen = -2 };
 
-std::vector<Coord> closingTokens(const NodeStates& nodes, const std::vector<Coord>& occupied,
-                                 const std::map<Coord, float>& dropped, float least) {
-  constexpr double kUncertain = 1e-6;  // no token costs more than -log of it
-  constexpr int32_t kSource = 0, kSink = 1, kSolid = -1, kUnlabelled = -2;
-  const double never = -std::log(kUncertain) * double(dropped.size() + 1);
-  const size_t n = nodes.states.size();
-  std::vector<int32_t> vertex(
-      n, kUnlabelled);  // in the graph; of a dropped token its way in, the way out is next
-  for (size_t i = 0; i < n; ++i)
-    if (nodes.states[i] != NodeState::kUnobserved)
-      vertex[i] = nodes.states[i] == NodeState::kFilled ? kSolid : kSource;
-  for (const Coord& c : occupied)
-    if (nodes.box.isInside(c)) vertex[size_t(nodes.index(c))] = kSolid;
-  int32_t vertices = 2;
-  std::vector<std::pair<Coord, float>> pipes;
-  for (const auto& token : dropped) {
-    if (!nodes.box.isInside(token.first) || vertex[size_t(nodes.index(token.first))] != kUnlabelled)
-      continue;
-    vertex[size_t(nodes.index(token.first))] = vertices, vertices += 2;
-    pipes.push_back(token);
-  }
-  const int32_t first_region = vertices;
-  auto isBorder = [&](const Coord& c) {
-    for (int axis = 0; axis < 3; ++axis)
-      if (c[axis] == nodes.box.min()[axis] || c[axis] == nodes.box.max()[axis]) return true;
-    return false;
-  };
-  auto forNeighbours = [&](const Coord& c, auto&& visit) {
-    for (int axis = 0; axis < 3; ++axis)
-      for (int side : {-1, 1}) {
-        Coord next = c;
-        next[axis] += side;
-        if (nodes.box.isInside(next)) visit(next);
-      }
-  };
-  // The rest is open for good: one vertex a connected region, the sink if it reaches the border.
-  std::vector<Coord> region;
-  for (auto node = nodes.box.begin(); node; ++node) {
-    if (vertex[size_t(nodes.index(*node))] != kUnlabelled) continue;
-    bool border = false;
-    region.assign(1, *node);
-    vertex[size_t(nodes.index(*node))] = vertices;
-    for (size_t i = 0; i < region.size(); ++i) {
-      border = border || isBorder(region[i]);
-      forNeighbours(region[i], [&](const Coord& next) {
-        int32_t& label = vertex[size_t(nodes.index(next))];
-        if (label == kUnlabelled) label = vertices, region.push_back(next);
+template <typename Visit>
+void forFaces(const CoordBBox& box, const Coord& c, const Visit& visit) {
+  for (int axis = 0; axis < 3; ++axis)
+    for (int side : {-1, 1}) {
+      Coord next = c;
+      next[axis] += side;
+      if (box.isInside(next)) visit(next);
+    }
+}
+
+bool isBorder(const CoordBBox& box, const Coord& c) {
+  for (int axis = 0; axis < 3; ++axis)
+    if (c[axis] == box.min()[axis] || c[axis] == box.max()[axis]) return true;
+  return false;
+}
+
+// The open nodes around the others, and to which connected region of all open nodes each belongs.
+// A region of open space is bounded by shells, each connected through faces: the outer one, and one
+// around each thing that stands in it. The outer shell has no open node beyond its largest x;
+// from any other a walk along x meets another shell of the region, or leaves the volume.
+class OpenRegions {
+ public:
+  OpenRegions(const CoordBBox& box, const TokenMap<int32_t>& kinds) : box_(box) {
+    for (const Coord& c : neighbourRing(kinds.tokens()))
+      if (box.isInside(c)) shell_.insert(c, int32_t(shell_.size()));
+    parent_.resize(shell_.size() + 1);  // the last one: the border
+    std::iota(parent_.begin(), parent_.end(), 0);
+    const std::vector<Coord>& nodes = shell_.tokens();
+    for (size_t i = 0; i < nodes.size(); ++i) {
+      if (isBorder(box, nodes[i])) join(i, shell_.size());
+      forFaces(box, nodes[i], [&](const Coord& next) {
+        if (const int32_t* other = shell_.find(next)) join(i, size_t(*other));
       });
     }
-    if (border)
-      for (const Coord& c : region) vertex[size_t(nodes.index(c))] = kSink;
-    else
-      ++vertices;
+    // One walk for each shell, from a node of its largest x.
+    std::vector<size_t> start(parent_.size(), shell_.size());
+    for (size_t i = 0; i < nodes.size(); ++i) {
+      size_t& best = start[root(i)];
+      if (best == shell_.size() || nodes[i].x() > nodes[best].x()) best = i;
+    }
+    for (size_t i : start) {
+      if (i == shell_.size()) continue;
+      Coord c = nodes[i].offsetBy(1, 0, 0);
+      while (box.isInside(c) && !shell_.find(c) && !kinds.find(c)) ++c.x();
+      if (!box.isInside(c))
+        join(i, shell_.size());
+      else if (const int32_t* other = shell_.find(c))
+        join(i, size_t(*other));
+    }
   }
 
-  Graph graph(static_cast<size_t>(vertices));
-  for (const auto& [c, probability] : pipes) {
-    const int32_t in = vertex[size_t(nodes.index(c))], out = in + 1;
+  const std::vector<Coord>& nodes() const { return shell_.tokens(); }
+  /// The vertex of the region of an open node beside another: kSink, or `first` and up.
+  int32_t vertexOf(const Coord& node, int32_t first) const {
+    const size_t region = root(size_t(*shell_.find(node)));
+    return region == root(shell_.size()) ? int32_t(kSink) : first + int32_t(region);
+  }
+  int32_t count() const { return int32_t(parent_.size()); }
+
+ private:
+  size_t root(size_t i) const {
+    while (parent_[i] != i) i = parent_[i] = parent_[parent_[i]];
+    return i;
+  }
+  void join(size_t a, size_t b) { parent_[root(a)] = root(b); }
+
+  CoordBBox box_;
+  TokenMap<int32_t> shell_;
+  mutable std::vector<size_t> parent_;
+};
+
+}  // namespace
+
+std::vector<int64_t> closingTokens(const SeenSpace& nodes, const std::vector<Coord>& occupied,
+                                   const Place& dropped, float least) {
+  constexpr double kUncertain = 1e-6;  // no token costs more than -log of it
+  const double never = -std::log(kUncertain) * double(dropped.size() + 1);
+  const CoordBBox& box = nodes.box;
+  TokenMap<int32_t> kinds;
+  for (const Coord& c : filledNodes(nodes)) kinds.set(c, kSolid);
+  for (const Coord& c : emptyNodes(nodes)) kinds.set(c, kSource);
+  for (const Coord& c : occupied)
+    if (box.isInside(c)) kinds.set(c, kSolid);
+  std::vector<int64_t> pipes(size_t(dropped.size()));  // rows, by coordinates
+  std::iota(pipes.begin(), pipes.end(), 0);
+  std::sort(pipes.begin(), pipes.end(),
+            [&](int64_t a, int64_t b) { return dropped.ijk[size_t(a)] < dropped.ijk[size_t(b)]; });
+  int32_t vertices = 2;
+  pipes.erase(std::remove_if(pipes.begin(), pipes.end(),
+                             [&](int64_t row) {
+                               const Coord& c = dropped.ijk[size_t(row)];
+                               if (!box.isInside(c) || !kinds.insert(c, vertices)) return true;
+                               vertices += 2;
+                               return false;
+                             }),
+              pipes.end());
+  const int32_t first_region = vertices;
+  const OpenRegions open(box, kinds);
+  const auto vertexOf = [&](const Coord& c) {
+    const int32_t* kind = kinds.find(c);
+    return kind ? *kind : open.vertexOf(c, first_region);
+  };
+
+  Graph graph(static_cast<size_t>(first_region + open.count()));
+  for (int64_t row : pipes) {
+    const Coord& c = dropped.ijk[size_t(row)];
+    const int32_t in = *kinds.find(c), out = in + 1;
     connect(graph, size_t(in), size_t(out),
-            -std::log(std::clamp(double(probability), kUncertain, 1.)));
-    if (isBorder(c)) connect(graph, size_t(out), kSink, never);
-    forNeighbours(c, [&](const Coord& next) {
-      const int32_t other = vertex[size_t(nodes.index(next))];
+            -std::log(std::clamp(double(dropped.probability[size_t(row)]), kUncertain, 1.)));
+    if (isBorder(box, c)) connect(graph, size_t(out), kSink, never);
+    forFaces(box, c, [&](const Coord& next) {
+      const int32_t other = vertexOf(next);
       if (other == kSolid) return;
       const bool is_pipe = other > kSink && other < first_region;
       if (other != kSource) connect(graph, size_t(out), size_t(other), never);
@@ -101,26 +156,26 @@ std::vector<Coord> closingTokens(const NodeStates& nodes, const std::vector<Coor
     });
   }
   // Where seen empty space meets a region that is open for good, that region is open to it.
-  for (auto node = nodes.box.begin(); node; ++node) {
-    const int32_t own = vertex[size_t(nodes.index(*node))];
-    if (own < first_region) continue;
-    bool open = false;
-    forNeighbours(*node, [&](const Coord& next) {
-      open = open || vertex[size_t(nodes.index(next))] == kSource;
+  for (const Coord& c : open.nodes()) {
+    const int32_t own = open.vertexOf(c, first_region);
+    bool meets = false;
+    forFaces(box, c, [&](const Coord& next) {
+      const int32_t* kind = kinds.find(next);
+      meets = meets || (kind && *kind == kSource);
     });
-    if (open) connect(graph, kSource, size_t(own), never);
+    if (meets && own != kSink) connect(graph, kSource, size_t(own), never);
   }
   boost::boykov_kolmogorov_max_flow(
       graph, boost::get(&Pipe::capacity, graph), boost::get(&Pipe::residual, graph),
-      boost::get(&Pipe::reverse, graph), boost::get(&Place::predecessor, graph),
-      boost::get(&Place::colour, graph), boost::get(&Place::distance, graph),
+      boost::get(&Pipe::reverse, graph), boost::get(&Vertex::predecessor, graph),
+      boost::get(&Vertex::colour, graph), boost::get(&Vertex::distance, graph),
       boost::get(boost::vertex_index, graph), size_t(kSource), size_t(kSink));
-  std::vector<Coord> closing;
+  std::vector<int64_t> closing;
   const auto source_colour = graph[kSource].colour;
-  for (const auto& [c, probability] : pipes) {
-    const size_t in = size_t(vertex[size_t(nodes.index(c))]);
+  for (int64_t row : pipes) {
+    const size_t in = size_t(*kinds.find(dropped.ijk[size_t(row)]));
     const bool cut = graph[in].colour == source_colour && graph[in + 1].colour != source_colour;
-    if (cut && probability > least) closing.push_back(c);
+    if (cut && dropped.probability[size_t(row)] > least) closing.push_back(row);
   }
   return closing;
 }

@@ -5,37 +5,11 @@
 #include <memory>
 #include <string>
 
+#include "mar/config.h"
 #include "vdb/frontier.h"
 #include "vdb/place.h"
 
 namespace vdbc {
-
-/// Every size of the completer; saved inside the weights file.
-struct CompleterConfig {
-  std::string preset = "small";
-  int latent_dim = 64, latent_groups = 1;  // as the encoder's (spec E10)
-  int width = 128, heads = 4, layers = 3;  // fine stage; layers each in H1 and H2
-  int coarse_width = 96, coarse_heads = 3, coarse_layers = 2;  // coarse stage, one tree level up
-  int diffusion_width = 256, diffusion_steps = 1000, diffusion_draws = 2;
-  bool paper_snr_weight = false;  // SNR / (1 + SNR) instead of min(1 / alpha_bar, 20)
-  bool rotary_positions = true;   // 3-D RoPE in self-attention
-  bool position_code = true;      // sinusoidal code on every token
-  bool coarse_stage = true;       // false: one dense stage, every unobserved token is a candidate
-  // What the fine stage sees around a chunk of targets, nearest first.
-  int context_tokens = 384, empty_tokens = 64, chunk_tokens = 160;
-  int coarse_empty_tokens = 256, coarse_chunk_tokens = 1024;
-  // Loss.
-  float focal_gamma = 0, focal_alpha = .5f;
-  float unobserved_weight = .25f;  // of U, labelled empty; 0 masks U from the loss as in the paper
-  // Generated tokens in training's context, up to: deviation of noise on their latents, share of
-  // wrong ones.
-  float context_noise = .2f, context_false_positives = .06f;
-
-  static CompleterConfig small() { return {}; }
-  static CompleterConfig paper();
-  std::string toJson() const;
-  static CompleterConfig fromJson(const std::string& text, const std::string& where);
-};
 
 struct CompleteSettings {
   float tau = .2f;         // a token is kept if its occupancy probability exceeds this
@@ -67,7 +41,7 @@ struct CompleteSettings {
 /// gives, bit by bit, what the uninterrupted run gives.
 using LevelListener = std::function<void(const Place& so_far, int32_t next_level)>;
 
-/// Trained networks, loaded once.
+/// Trained networks, loaded once. Const calls may run at the same time from several threads.
 class Completer {
  public:
   /// Throws Error if the file is missing, corrupt or of another kind.
@@ -84,8 +58,10 @@ class Completer {
   /// tokens first; generated ones after them stay as they are and are not visited again. Its rows
   /// come first, bit-identical unless refine_observed; generated latents are rounded to half
   /// precision, so that files hold them exactly. Tokens that are F or E in `start.seen` are never
-  /// visited. Places beyond 12.8 m are looked at in overlapping windows, by the coarse stage and by
-  /// the position code; windows without anything filled stay as they are. Same seed, same place.
+  /// visited. Places larger than the configuration's `extent_m` are looked at in overlapping
+  /// windows, by the coarse stage and by the position code; windows without anything filled stay as
+  /// they are. Time and memory follow what was seen and what is generated, not the volume. Same
+  /// seed, same place, whatever the number of threads.
   Place complete(const Place& start, const CompleteSettings& settings, Progress& progress,
                  const LevelListener& listener = nullptr) const;
 

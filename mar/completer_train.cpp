@@ -1,23 +1,17 @@
 #include "mar/completer_train.h"
 
+#include <openvdb/tools/Prune.h>
+
 #include <algorithm>
 #include <cmath>
 #include <future>
-#include <set>
-#include <unordered_map>
 
 #include "encoder/trainer.h"
-#include "mar/network.h"
+#include "mar/context.h"
 #include "mar/training_masks.h"
 
 namespace vdbc {
 namespace {
-
-constexpr float kFrontierShare = .6f;  // of a chunk's targets, at most
-constexpr double kAlone = .75;         // of the samples: condition tokens are all that is visible
-constexpr double kOwnGate =
-    .75;  // of the second half's samples: the fine stage works behind the coarse one as it is
-constexpr double kWindows = .5;  // of the samples: looked at through another window
 
 double uniform(torch::Generator& random) { return torch::rand({1}, random).item<double>(); }
 double uniform(double low, double high, torch::Generator& random) {
@@ -35,7 +29,7 @@ std::vector<Coord> selectRandom(const std::vector<Coord>& from, double share,
 
 }  // namespace
 
-CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const NodeStates& truth,
+CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const SeenSpace& truth,
                           torch::Generator& random) {
   CoarseMask m;
   const std::vector<Coord> worked_on = selectRandom(unknown, uniform(.3, 1, random), random);
@@ -51,16 +45,17 @@ CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const NodeStates& t
 }
 
 FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& s,
-                      double false_positives, torch::Generator& random) {
+                      const CompleterConfig& config, torch::Generator& random) {
   FineMask m;
   const double kind = uniform(random);
-  const bool alone = kind < kAlone, growth = kind < (1 + kAlone) / 2;
+  const double share = double(config.alone_share);
+  const bool alone = kind < share, growth = kind < (1 + share) / 2;
   const std::vector<int32_t> levels = breadthFirstLevels(candidates, s.condition.ijk);
   const int32_t deepest = levels.empty() ? 1 : *std::max_element(levels.begin(), levels.end());
   const int32_t depth = int32_t(torch::randint(alone ? deepest : 6, {1}, random).item<int64_t>());
   const Tensor draws = torch::rand({int64_t(candidates.size()), 2}, random);
   const double hidden = uniform(.5, 1, random);
-  const double wrong = uniform(0, false_positives, random);
+  const double wrong = uniform(0, config.context_false_positives, random);
   std::vector<Coord> open;
   for (size_t i = 0; i < candidates.size(); ++i) {
     const float* d = draws.data_ptr<float>() + 2 * i;
@@ -89,9 +84,10 @@ FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSamp
   return m;
 }
 
-CoordBBox drawBounds(const CompletionSample& s, torch::Generator& random) {
+CoordBBox drawBounds(const CompletionSample& s, const CompleterConfig& config,
+                     torch::Generator& random) {
   const VoxelFrame& frame = s.condition.frame;
-  if (uniform(random) >= kWindows) return frame.bounds;
+  if (uniform(random) >= config.window_share) return frame.bounds;
   const int outwards = int(2.8 / frame.voxel_m / 4), most = int(16 / frame.voxel_m / 4);
   CoordBBox bounds = frame.bounds;
   for (int axis = 0; axis < 3; ++axis) {
@@ -104,9 +100,8 @@ CoordBBox drawBounds(const CompletionSample& s, torch::Generator& random) {
     bounds.min()[axis] -= 4 * low, bounds.max()[axis] += 4 * high;
   }
   const bool holds =
-      std::any_of(s.condition.ijk.begin(), s.condition.ijk.end(), [&](const Coord& token) {
-        return bounds.isInside(Coord(2 * token.x(), 2 * token.y(), 2 * token.z()));
-      });
+      std::any_of(s.condition.ijk.begin(), s.condition.ijk.end(),
+                  [&](const Coord& token) { return bounds.isInside(firstVoxel(token, 1)); });
   return holds ? bounds : frame.bounds;
 }
 
@@ -117,7 +112,7 @@ namespace {
 struct Labels {
   Tensor truth, weight;  // [N]
 };
-Labels labelsOf(const std::vector<Coord>& positions, const NodeStates& truth,
+Labels labelsOf(const std::vector<Coord>& positions, const SeenSpace& truth,
                 float unobserved_weight) {
   const int64_t n = int64_t(positions.size());
   Labels l{torch::zeros({n}), torch::ones({n})};
@@ -139,38 +134,38 @@ Tensor occupancyLoss(const Tensor& logits, const Labels& l, const CompleterConfi
 
 struct Losses {
   Tensor coarse, fine, linear, diffusion, refinement;
-  Tensor total() const { return coarse + fine + linear + .5f * diffusion + .25f * refinement; }
+  Tensor total(const CompleterConfig& c) const {
+    return coarse + fine + linear + c.diffusion_weight * diffusion +
+           c.refinement_weight * refinement;
+  }
 };
 
 // Target latents by position, where the dense views saw a surface: what else a file holds is no
 // truth (spec A1).
 struct TargetRows {
-  std::unordered_map<uint64_t, int64_t> row;
+  TokenMap<int64_t> row;
   std::vector<int64_t> all;
-  static uint64_t key(const Coord& c) {
-    return uint64_t(uint32_t(c.x() + (1 << 20))) << 42 |
-           uint64_t(uint32_t(c.y() + (1 << 20))) << 21 | uint64_t(uint32_t(c.z() + (1 << 20)));
-  }
   explicit TargetRows(const CompletionSample& s) {
     for (size_t i = 0; i < s.target.ijk.size(); ++i) {
       if (s.target_nodes.at(s.target.ijk[i]) != NodeState::kFilled) continue;
-      row[key(s.target.ijk[i])] = int64_t(i);
+      row.set(s.target.ijk[i], int64_t(i));
       all.push_back(int64_t(i));
     }
   }
   int64_t find(const Coord& c) const {
-    const auto found = row.find(key(c));
-    return found == row.end() ? -1 : found->second;
+    const int64_t* found = row.find(c);
+    return found ? *found : -1;
   }
 };
 
 // The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities
 // there.
 Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s,
-                  const VoxelFrame& frame, torch::Generator& random, std::map<Coord, float>* gate) {
-  for (const Coord& c : scene.coarse_filled) (*gate)[c] = 1;
-  CoarseMask mask = drawCoarseMask(scene.coarse_unknown, s.target_coarse, random);
-  for (const Coord& c : mask.visible) (*gate)[c] = 1;
+                  const std::vector<Coord>& unknown, const VoxelFrame& frame,
+                  torch::Generator& random, Gate* gate) {
+  for (const Coord& c : scene.coarse_filled) gate->set(c, 1);
+  CoarseMask mask = drawCoarseMask(unknown, s.target_coarse, random);
+  for (const Coord& c : mask.visible) gate->set(c, 1);
   if (mask.targets.empty()) return torch::zeros({});
   // Inference asks in chunks of neighbours; so does training.
   const Coord around = mask.targets[size_t(
@@ -181,16 +176,16 @@ Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionS
   const Tensor logits = net.coarseLogits(
       coarseInputs(scene, mask.visible, targets, net.config.coarse_empty_tokens), frame);
   const Tensor p = logits.detach().sigmoid().contiguous();
-  for (size_t i = 0; i < targets.size(); ++i) (*gate)[targets[i]] = p.data_ptr<float>()[i];
+  for (size_t i = 0; i < targets.size(); ++i) gate->set(targets[i], p.data_ptr<float>()[i]);
   // Positions not worked on get the probability that a middling coarse stage would give them, so
   // that the fine stage sees whole neighbourhoods.
-  const Tensor draws = torch::rand({int64_t(scene.coarse_unknown.size()), 2}, random);
-  for (size_t i = 0; i < scene.coarse_unknown.size(); ++i) {
+  const Tensor draws = torch::rand({int64_t(unknown.size()), 2}, random);
+  for (size_t i = 0; i < unknown.size(); ++i) {
     const float* d = draws.data_ptr<float>() + 2 * i;
-    if (s.target_coarse.at(scene.coarse_unknown[i]) == NodeState::kFilled) {
-      gate->emplace(scene.coarse_unknown[i], .3f + .7f * d[0]);
+    if (s.target_coarse.at(unknown[i]) == NodeState::kFilled) {
+      gate->insert(unknown[i], .3f + .7f * d[0]);
     } else if (d[1] < .08f) {
-      gate->emplace(scene.coarse_unknown[i], .05f + .45f * d[0]);
+      gate->insert(unknown[i], .05f + .45f * d[0]);
     }
   }
   return occupancyLoss(logits, labelsOf(targets, s.target_coarse, net.config.unobserved_weight),
@@ -201,36 +196,45 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
                     double own_gate, torch::Generator& random) {
   const CompleterConfig& c = net.config;
   VoxelFrame frame = s.condition.frame;
-  frame.bounds = drawBounds(s, random);
-  const SceneTokens scene =
-      sceneTokens(statesIn(s.seen_nodes, frame.bounds), statesIn(s.seen_coarse, frame.bounds));
-  std::map<Coord, float> gate;
+  frame.bounds = drawBounds(s, c, random);
+  const SceneTokens scene = sceneTokens(seenIn(s.seen_nodes, nodesIn(frame.bounds, 1)),
+                                        seenIn(s.seen_coarse, nodesIn(frame.bounds, 2)));
+  const std::vector<Coord> unknown = unobservedNodes(scene.coarse, scene.coarse.box);
+  Gate drawn;
   Losses l;
-  l.coarse = c.coarse_stage ? coarseLoss(net, scene, s, frame, random, &gate) : torch::zeros({});
+  l.coarse =
+      c.coarse_stage ? coarseLoss(net, scene, s, unknown, frame, random, &drawn) : torch::zeros({});
   l.fine = l.linear = l.diffusion = l.refinement = torch::zeros({});
 
   // The fine stage works inside what the coarse stage keeps, as it is or as a better one would be:
   // all of the truth and what it takes for true.
   const bool own = !c.coarse_stage || uniform(random) < own_gate;
   const double tau = own ? CompleteSettings().coarse_tau : uniform(.05, .5, random);
+  Gate asked;
   if (own) {
     torch::NoGradGuard no_grad;
-    gate.clear();
-    for (const Coord& node : scene.coarse_filled) gate[node] = 1;
+    for (const Coord& node : scene.coarse_filled) asked.set(node, 1);
     // What a larger window adds is all unseen: none of it is worth the fine stage's time.
     std::vector<Coord> near;
-    for (const Coord& node : scene.coarse_unknown)
+    for (const Coord& node : unknown)
       if (s.seen_coarse.box.isInside(node)) near.push_back(node);
-    net.coarseProbabilities(scene, near, frame, &gate);
+    for (const std::vector<Coord>& chunk : chunksOf(near, c.coarse_chunk_tokens)) {
+      const std::vector<float> p = coarseProbability(net, scene, chunk, frame);
+      for (size_t i = 0; i < chunk.size(); ++i) asked.set(chunk[i], p[i]);
+    }
   }
+  const Gate& gate = own ? asked : drawn;
   std::vector<Coord> open;
-  for (const auto& [node, probability] : gate)
-    if (probability > tau || (!own && s.target_coarse.at(node) == NodeState::kFilled))
+  for (size_t i = 0; i < gate.size(); ++i) {
+    const Coord& node = gate.tokens()[i];
+    if (double(gate.values()[i]) > tau || (!own && s.target_coarse.at(node) == NodeState::kFilled))
       open.push_back(node);
+  }
+  std::sort(open.begin(), open.end());
   const std::vector<Coord> candidates = unobservedChildren(open, scene.nodes);
   const TargetRows rows(s);
   if (candidates.empty() || rows.all.empty()) return l;
-  const FineMask m = drawFineMask(candidates, s, c.context_false_positives, random);
+  const FineMask m = drawFineMask(candidates, s, c, random);
   const std::vector<Coord>& around = m.frontier.empty() ? m.others : m.frontier;
   if (around.empty()) return l;
 
@@ -238,7 +242,7 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
       around[size_t(torch::randint(int64_t(around.size()), {1}, random).item<int64_t>())];
   const Eigen::Vector3d centre(centre_token.x(), centre_token.y(), centre_token.z());
   std::vector<Coord> targets =
-      nearestOf(m.frontier, centre, int64_t(kFrontierShare * float(c.chunk_tokens)));
+      nearestOf(m.frontier, centre, int64_t(c.frontier_share * float(c.chunk_tokens)));
   for (const Coord& t : nearestOf(m.others, centre, c.chunk_tokens - int64_t(targets.size())))
     targets.push_back(t);
 
@@ -249,37 +253,24 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
   std::vector<Coord> context = s.condition.ijk;
   context.insert(context.end(), m.visible.begin(), m.visible.end());
   context.insert(context.end(), m.false_visible.begin(), m.false_visible.end());
-  std::array<TokenSet, kTokenKinds> in;
-  std::vector<int64_t> condition_rows, visible_rows;
-  for (int64_t row : nearestRows(context, centre, c.context_tokens)) {
-    const Coord token = context[size_t(row)];
-    if (row < s.condition.size()) {
-      in[kCondition].coords.push_back(token);
-      condition_rows.push_back(row);
-    } else {
-      in[kVisible].coords.push_back(token);
-      // A wrong token carries some true token's latent: plausible content in a wrong place.
-      const int64_t own = rows.find(token);
-      visible_rows.push_back(own >= 0 ? own : anyRow());
-    }
+  FineChunk chunk = fineChunk(scene, gate, context, s.condition.size(), targets, centre,
+                              c.context_tokens, c.empty_tokens);
+  TokenSets& in = chunk.tokens;
+  // A wrong token carries some true token's latent: plausible content in a wrong place.
+  std::vector<int64_t> visible_rows;
+  for (const Coord& token : in[kVisible].coords) {
+    const int64_t own_row = rows.find(token);
+    visible_rows.push_back(own_row >= 0 ? own_row : anyRow());
   }
   const Tensor condition_z =
       net.standardise(torch::tensor(s.condition.z).view({s.condition.size(), -1}));
   const Tensor target_z = net.standardise(torch::tensor(s.target.z).view({s.target.size(), -1}));
   in[kCondition].features =
-      condition_z.index_select(0, torch::tensor(condition_rows, torch::kInt64));
+      condition_z.index_select(0, torch::tensor(chunk.rows[kCondition], torch::kInt64));
   in[kVisible].features = target_z.index_select(0, torch::tensor(visible_rows, torch::kInt64));
   in[kVisible].features =
       in[kVisible].features +
       uniform(0, c.context_noise, random) * torch::randn(in[kVisible].features.sizes(), random);
-  in[kEmptyToken].coords = nearestOf(scene.empty_shell, centre, c.empty_tokens);
-  std::vector<float> parent_probability;
-  for (const Coord& t : targets) {
-    const auto found = gate.find(tokenCoord(t, 1));
-    parent_probability.push_back(found == gate.end() ? 0.f : found->second);
-  }
-  in[kTarget] = {torch::tensor(parent_probability).unsqueeze(1), targets};
-
   const CompleterNet::Fine f = net.fine(in, frame);
   l.fine = occupancyLoss(f.logits, labelsOf(targets, s.target_nodes, c.unobserved_weight), c);
 
@@ -305,7 +296,7 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
           std::ptrdiff_t(std::min<size_t>(64, in[kCondition].coords.size())));
   const auto refined =
       latentLoss(*net.refinement, f.conditions.slice(0, 0, int64_t(some.size())).detach(), some);
-  l.refinement = refined.linear + .5f * refined.diffusion;
+  l.refinement = refined.linear + c.diffusion_weight * refined.diffusion;
   return l;
 }
 
@@ -340,9 +331,8 @@ std::map<std::string, double> validate(const std::string& weights,
   for (const CompletionSample& s : samples) {
     const Place whole = completer.complete(s.condition, settings, silent);
     double hit = 0, filled = 0, truth = 0, known = 0, squared = 0, matched = 0;
-    for (auto node = s.seen_nodes.box.begin(); node; ++node)
-      truth += s.seen_nodes.at(*node) == NodeState::kUnobserved &&
-               s.target_nodes.at(*node) == NodeState::kFilled;
+    for (const Coord& node : filledNodes(s.target_nodes))
+      truth += s.seen_nodes.at(node) == NodeState::kUnobserved;
     const TargetRows rows(s);
     for (int64_t k = s.condition.size(); k < whole.size(); ++k) {
       const NodeState state = s.target_nodes.at(whole.ijk[size_t(k)]);
@@ -368,12 +358,11 @@ std::map<std::string, double> validate(const std::string& weights,
 // What the condition views saw, at node resolution, for roll-outs without the views.
 std::shared_ptr<const SeenSpace> nodeSpace(const CompletionSample& s) {
   const auto space = std::make_shared<SeenSpace>();
-  for (auto node = s.seen_nodes.box.begin(); node; ++node) {
-    const NodeState state = s.seen_nodes.at(*node);
-    if (state == NodeState::kUnobserved) continue;
-    TokenMask& mask = state == NodeState::kFilled ? space->filled : space->empty;
-    for (int slot = 0; slot < 8; ++slot) mask.setValueOn(childCoord(*node, slot));
-  }
+  space->box = s.condition.frame.bounds;
+  for (const Coord& node : filledNodes(s.seen_nodes))
+    space->filled.sparseFill(voxelsIn(node, 1), true, true);
+  for (const Coord& node : emptyNodes(s.seen_nodes))
+    space->empty.sparseFill(voxelsIn(node, 1), true, true);
   return space;
 }
 
@@ -422,13 +411,13 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
     const std::vector<CompletionSample> current = next.valid() ? next.get() : load(first);
     next = std::async(std::launch::async, load, first + settings.batch);
     // Before the coarse stage is any good, there is nothing behind it to learn from.
-    const double own_gate = 2 * trainer.step() < settings.steps ? 0 : kOwnGate;
+    const double own_gate = 2 * trainer.step() < settings.steps ? 0 : double(config.own_gate_share);
     for (size_t k = 0; k < current.size(); ++k) {
       torch::Generator random =
           at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(first) + k);
       const MixedPrecision mixed(settings.mixed_precision);
       const Losses l = sampleLosses(*net, current[k], colours, own_gate, random);
-      const Tensor total = l.total();
+      const Tensor total = l.total(config);
       trainer.addSample(total, {{"loss", total.item<double>()},
                                 {"coarse", l.coarse.item<double>()},
                                 {"fine", l.fine.item<double>()},
@@ -463,14 +452,14 @@ CompleterStep completerStep(const CompleterConfig& config, const CompletionSampl
   for (double* loss : {&result.before, &result.after}) {
     optimiser.zero_grad();
     torch::Generator random = at::detail::createCPUGenerator(seed);
-    const Losses l = sampleLosses(*net, sample, colours, kOwnGate, random);
-    *loss = l.total().item<double>();
+    const Losses l = sampleLosses(*net, sample, colours, double(config.own_gate_share), random);
+    *loss = l.total(config).item<double>();
     if (loss == &result.before && l.refinement.requires_grad()) {
       l.refinement.backward({}, true);
       result.trunk_gradient_of_refinement = gradientSum(*net->trunk);
       optimiser.zero_grad();
     }
-    l.total().backward();
+    l.total(config).backward();
     if (loss == &result.before) result.gradient_sum = gradientSum(*net);
     optimiser.step();
   }
@@ -479,31 +468,47 @@ CompleterStep completerStep(const CompleterConfig& config, const CompletionSampl
 
 namespace {
 
-Tensor stateTensor(const NodeStates& s) {
-  Tensor t = torch::empty({7 + int64_t(s.states.size() + 3) / 4}, torch::kInt32);
-  int32_t* p = t.data_ptr<int32_t>();
-  p[0] = s.level;
-  for (int i = 0; i < 3; ++i) p[1 + i] = s.box.min()[i], p[4 + i] = s.box.max()[i];
-  std::memcpy(p + 7, s.states.data(), s.states.size());
-  return t;
+constexpr int kMaxSide = 8192;  // nodes
+
+// What was seen as tensors NAME.box [7] (level, corners), NAME.filled and NAME.empty [n, 3].
+void addSeen(const SeenSpace& s, const std::string& name, TensorFile* file) {
+  const Coord &lo = s.box.min(), &hi = s.box.max();
+  file->tensors[name + ".box"] =
+      torch::tensor({s.level, lo.x(), lo.y(), lo.z(), hi.x(), hi.y(), hi.z()}, torch::kInt32);
+  file->tensors[name + ".filled"] = coordTensor(filledNodes(s));
+  file->tensors[name + ".empty"] = coordTensor(emptyNodes(s));
 }
 
-NodeStates statesOf(const Tensor& t, const std::string& path) {
-  require(t.scalar_type() == torch::kInt32 && t.numel() >= 7, "readSample: ", path, ": bad states");
-  const int32_t* p = t.data_ptr<int32_t>();
-  NodeStates s;
-  s.level = p[0];
-  s.box = CoordBBox(Coord(p[1], p[2], p[3]), Coord(p[4], p[5], p[6]));
+SeenSpace readSeen(const TensorFile& file, const std::string& name, const std::string& path) {
+  const auto get = [&](const char* part) {
+    const auto found = file.tensors.find(name + part);
+    require(found != file.tensors.end() && found->second.scalar_type() == torch::kInt32,
+            "readSample: ", path, ": expected a tensor ", name, part);
+    return found->second;
+  };
+  SeenSpace s;
+  const Tensor box = get(".box");
+  require(box.numel() == 7, "readSample: ", path, ": ", name, ": bad box");
+  const int32_t* b = box.data_ptr<int32_t>();
+  s.level = b[0];
+  s.box = CoordBBox(Coord(b[1], b[2], b[3]), Coord(b[4], b[5], b[6]));
   for (int i = 0; i < 3; ++i)
-    require(p[4 + i] >= p[1 + i] && int64_t(p[4 + i]) - p[1 + i] < 8192, "readSample: ", path,
-            ": expected a box of at most 8192 nodes a side");
-  const int64_t n = int64_t(s.box.volume());
-  require(t.numel() == 7 + (n + 3) / 4, "readSample: ", path, ": expected ", n,
-          " states, found another count");
-  s.states.resize(size_t(n));
-  std::memcpy(s.states.data(), p + 7, size_t(n));
-  for (NodeState state : s.states)
-    require(uint8_t(state) <= 2, "readSample: ", path, ": a state is none of F, E, U");
+    require(b[4 + i] >= b[1 + i] && int64_t(b[4 + i]) - b[1 + i] < kMaxSide, "readSample: ", path,
+            ": expected a box of at most ", kMaxSide, " nodes a side");
+  for (auto [part, mask] :
+       {std::pair<const char*, TokenMask*>{".filled", &s.filled}, {".empty", &s.empty}}) {
+    const Tensor coords = get(part);
+    require(coords.dim() == 2 && coords.size(1) == 3, "readSample: ", path, ": ", name, part,
+            ": expected coordinates");
+    const int32_t* p = coords.data_ptr<int32_t>();
+    for (int64_t i = 0; i < coords.size(0); ++i, p += 3) {
+      const Coord c(p[0], p[1], p[2]);
+      require(s.box.isInside(c), "readSample: ", path, ": ", name, part, ": ", c,
+              " lies outside the box");
+      mask->setValueOn(c);
+    }
+  }
+  openvdb::tools::prune(s.empty);
   return s;
 }
 
@@ -516,10 +521,10 @@ void writeSample(const CompletionSample& s, const std::string& path) {
     file.tensors[joinText(name, ".ijk")] = coordTensor(grid->ijk);
     file.tensors[joinText(name, ".z")] = torch::tensor(grid->z).view({grid->size(), grid->dim});
   }
-  file.tensors["seen_nodes"] = stateTensor(s.seen_nodes);
-  file.tensors["seen_coarse"] = stateTensor(s.seen_coarse);
-  file.tensors["target_nodes"] = stateTensor(s.target_nodes);
-  file.tensors["target_coarse"] = stateTensor(s.target_coarse);
+  addSeen(s.seen_nodes, "seen_nodes", &file);
+  addSeen(s.seen_coarse, "seen_coarse", &file);
+  addSeen(s.target_nodes, "target_nodes", &file);
+  addSeen(s.target_coarse, "target_coarse", &file);
   const CoordBBox& b = s.condition.frame.bounds;
   file.tensors["bounds"] =
       torch::tensor({b.min().x(), b.min().y(), b.min().z(), b.max().x(), b.max().y(), b.max().z()},
@@ -536,11 +541,12 @@ CompletionSample readSample(const std::string& path) {
             "readSample: ", path, ": expected a tensor ", name);
     return found->second;
   };
-  CompletionSample s;
-  s.seen_nodes = statesOf(get("seen_nodes", torch::kInt32), path);
-  s.seen_coarse = statesOf(get("seen_coarse", torch::kInt32), path);
-  s.target_nodes = statesOf(get("target_nodes", torch::kInt32), path);
-  s.target_coarse = statesOf(get("target_coarse", torch::kInt32), path);
+  CompletionSample s{{},
+                     {},
+                     readSeen(file, "seen_nodes", path),
+                     readSeen(file, "seen_coarse", path),
+                     readSeen(file, "target_nodes", path),
+                     readSeen(file, "target_coarse", path)};
   const Tensor bounds = get("bounds", torch::kInt32), voxel = get("voxel_m", torch::kFloat32);
   require(bounds.numel() == 6 && voxel.numel() == 1, "readSample: ", path, ": bad frame");
   for (const auto& [name, grid] :

@@ -12,9 +12,9 @@ namespace vdbc {
 /// One training scene in latent space: what a few condition views see and what many views see, in
 /// the same frame. Needs no 3-D ground truth.
 struct CompletionSample {
-  Place condition, target;                 // E(sparse), E(dense); without what was seen
-  NodeStates seen_nodes, seen_coarse;      // of the condition views, levels 1 and 2
-  NodeStates target_nodes, target_coarse;  // of the dense views
+  Place condition, target;                // E(sparse), E(dense); without what was seen
+  SeenSpace seen_nodes, seen_coarse;      // of the condition views, levels 1 and 2
+  SeenSpace target_nodes, target_coarse;  // of the dense views
 };
 
 /// Temporary name, then rename; safetensors. Throw Error.

@@ -1,10 +1,9 @@
 #pragma once
-// Private: the completer as torch modules, and how scenes become its inputs.
+// Private: the completer as torch modules.
 #include <array>
-#include <map>
 
 #include "encoder/layers.h"
-#include "mar/completer.h"
+#include "mar/config.h"
 #include "mar/heads.h"
 
 namespace vdbc {
@@ -17,6 +16,7 @@ struct TokenSet {
 
 /// Inputs in the order H1 and H2 see them; each kind has its own linear layer and LayerNorm (A4).
 enum TokenKind { kCondition, kVisible, kEmptyToken, kTarget, kTokenKinds };
+using TokenSets = std::array<TokenSet, kTokenKinds>;
 
 struct StageSizes {
   int width, heads, layers;
@@ -25,16 +25,16 @@ struct StageSizes {
 
 /// H1 sees condition, visible and empty tokens; H2 sees H1's output and the mask tokens (A4).
 struct MaskedTransformer : torch::nn::Module {
-  MaskedTransformer(const StageSizes& sizes, bool rotary_positions, bool position_code);
+  MaskedTransformer(const StageSizes& sizes, const CompleterConfig& config);
   struct Output {
     Tensor context;  // [condition + visible + empty, C], H1's output
     Tensor tokens;   // [all, C], H2's output, same order, targets last
   };
-  Output forward(const std::array<TokenSet, kTokenKinds>& inputs, int level,
-                 const VoxelFrame& frame);
+  Output forward(const TokenSets& inputs, int level, const VoxelFrame& frame);
 
   const StageSizes sizes;
   const bool rotary_positions, position_code;
+  const PositionConfig positions;
   std::array<Linear, kTokenKinds> embed{nullptr, nullptr, nullptr, nullptr};
   std::array<torch::nn::LayerNorm, kTokenKinds> embed_norm{nullptr, nullptr, nullptr, nullptr};
   Linear position_in{nullptr};
@@ -42,35 +42,19 @@ struct MaskedTransformer : torch::nn::Module {
   torch::nn::LayerNorm out_norm{nullptr};
 };
 
-/// States of the 8 children of coarse nodes, one-hot F, E, U: [N, 24].
-constexpr int kCoarseFeatures = 24;
-Tensor coarseFeatures(const std::vector<Coord>& nodes, const NodeStates& children);
-
-/// What is known of a scene, as token lists of both levels.
-struct SceneTokens {
-  NodeStates nodes, coarse;           // levels 1 and 2
-  std::vector<Coord> empty_shell;     // level-1 E nodes with an unobserved neighbour
-  std::vector<Coord> coarse_filled;   // level-2 nodes with an F voxel
-  std::vector<Coord> coarse_empty;    // level-2 E nodes with an unobserved neighbour
-  std::vector<Coord> coarse_unknown;  // level-2 nodes with no F and some U voxel
-};
-SceneTokens sceneTokens(NodeStates nodes, NodeStates coarse);
+constexpr int kCoarseFeatures = 24;  // of a coarse node: its 8 children, one-hot F, E, U
 
 struct CompleterNet : torch::nn::Module {
   explicit CompleterNet(const CompleterConfig& config);
 
   /// Occupancy logits [targets] of coarse nodes.
-  Tensor coarseLogits(const std::array<TokenSet, kTokenKinds>& inputs, const VoxelFrame& frame);
-  /// Their probabilities as inference asks for them, in chunks of neighbours; 1 without a coarse
-  /// stage.
-  void coarseProbabilities(const SceneTokens& scene, const std::vector<Coord>& unknown,
-                           const VoxelFrame& frame, std::map<Coord, float>* probability);
+  Tensor coarseLogits(const TokenSets& inputs, const VoxelFrame& frame);
   struct Fine {
     Tensor logits;      // [targets]
     Tensor targets;     // [targets, C] tokens for the diffusion head
     Tensor conditions;  // [conditions, C] tokens for the refinement head
   };
-  Fine fine(const std::array<TokenSet, kTokenKinds>& inputs, const VoxelFrame& frame);
+  Fine fine(const TokenSets& inputs, const VoxelFrame& frame);
 
   /// Latents <-> unit deviation.
   Tensor standardise(const Tensor& z) { return (z - latent_mean) / latent_deviation; }
@@ -89,26 +73,5 @@ struct CompleterNet : torch::nn::Module {
   std::shared_ptr<DiffusionHead> diffusion, refinement;
   Tensor latent_mean, latent_deviation;  // [D] buffers, from the training latents
 };
-
-/// Inputs of the coarse stage for some target positions.
-std::array<TokenSet, kTokenKinds> coarseInputs(const SceneTokens& scene,
-                                               const std::vector<Coord>& visible,
-                                               const std::vector<Coord>& targets, int empty_tokens);
-
-/// The `count` of `coords` nearest to `centre`, by distance, ties by row: row indices.
-std::vector<int64_t> nearestRows(const std::vector<Coord>& coords, const Eigen::Vector3d& centre,
-                                 int64_t count);
-/// Their coordinates.
-std::vector<Coord> nearestOf(const std::vector<Coord>& coords, const Eigen::Vector3d& centre,
-                             int64_t count);
-
-/// Parts of at most `size`, about equal, of tokens that lie together.
-std::vector<std::vector<Coord>> chunksOf(const std::vector<Coord>& tokens, int64_t size);
-
-/// The states of the nodes in a box of voxels; unobserved where `states` has none.
-NodeStates statesIn(const NodeStates& states, const CoordBBox& voxels);
-
-/// Level-1 nodes of the given coarse nodes that were not observed.
-std::vector<Coord> unobservedChildren(const std::vector<Coord>& coarse, const NodeStates& nodes);
 
 }  // namespace vdbc

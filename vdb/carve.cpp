@@ -710,6 +710,7 @@ std::vector<float> usableDepth(const DepthView& view, const CarveSettings& setti
 SeenSpace carve(const VoxelFrame& frame, const std::vector<DepthView>& views,
                 const CarveSettings& settings, Progress& progress) {
   SeenSpace space;
+  space.box = frame.bounds;
   if (frame.bounds.empty() || views.empty()) return space;
   report(progress, 0);
 
@@ -785,53 +786,11 @@ SeenSpace carveByTraversal(const VoxelFrame& frame, const std::vector<DepthView>
   }
   empty.topologyDifference(filled);
   SeenSpace space;
+  space.box = frame.bounds;
   space.filled.root() = tokenMask({&filled}).root();
   space.empty.root() = tokenMask({&empty}).root();
   openvdb::tools::prune(space.empty);
   return space;
-}
-
-NodeStates poolStates(const VoxelFrame& frame, const SeenSpace& space, int level) {
-  require(level >= 0 && level < 16, "poolStates: expected a level of 0-15, found ", level);
-  NodeStates pooled;
-  pooled.level = level;
-  if (frame.bounds.empty()) return pooled;
-  pooled.box =
-      CoordBBox(tokenCoord(frame.bounds.min(), level), tokenCoord(frame.bounds.max(), level));
-  const auto node = [&](const Coord& ijk) {
-    const Coord low(ijk.x() * (1 << level), ijk.y() * (1 << level), ijk.z() * (1 << level));
-    CoordBBox box = CoordBBox::createCube(low, 1 << level);
-    box.intersect(frame.bounds);
-    return box;
-  };
-  // Calls f(node's index, its coordinate, voxels of the active value inside it).
-  const auto forEachActive = [&](const TokenMask& mask, const auto& f) {
-    for (auto v = mask.cbeginValueOn(); v; ++v) {
-      CoordBBox box;
-      v.getBoundingBox(box);
-      box.intersect(frame.bounds);
-      if (box.empty()) continue;
-      const CoordBBox nodes(tokenCoord(box.min(), level), tokenCoord(box.max(), level));
-      if (nodes.min() == nodes.max()) {
-        f(size_t(pooled.index(nodes.min())), nodes.min(), box.volume());
-        continue;
-      }
-      for (auto c = nodes.begin(); c; ++c) {
-        CoordBBox part = node(*c);
-        part.intersect(box);
-        f(size_t(pooled.index(*c)), *c, part.volume());
-      }
-    }
-  };
-  std::vector<uint64_t> empty(size_t(pooled.box.volume()), 0);
-  pooled.states.assign(empty.size(), NodeState::kUnobserved);
-  forEachActive(space.empty, [&](size_t i, const Coord& ijk, uint64_t voxels) {
-    empty[i] += voxels;
-    if (empty[i] == node(ijk).volume()) pooled.states[i] = NodeState::kEmpty;
-  });
-  forEachActive(space.filled,
-                [&](size_t i, const Coord&, uint64_t) { pooled.states[i] = NodeState::kFilled; });
-  return pooled;
 }
 
 }  // namespace vdbc

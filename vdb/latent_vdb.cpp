@@ -261,6 +261,7 @@ Place readLatentVdb(const std::string& path) {
     throw Error(joinText(kRead, ": ", path, ": corrupt or unreadable: ", error.what()));
   }
   const auto seen = std::make_shared<SeenSpace>();
+  seen->box = g.frame.bounds;
   seen->filled.root() = maskOfGrid(kRead, *filled, g.frame.bounds, path).root();
   seen->empty.root() = maskOfGrid(kRead, *empty, g.frame.bounds, path).root();
   g.seen = seen;

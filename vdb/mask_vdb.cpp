@@ -43,9 +43,7 @@ TokenMask readTokenMask(const std::string& path, const VoxelFrame& frame, int le
   require(bool(transform), kRead, ": ", path,
           ": expected a grid of type bool, mask, float or vec3s, found none");
 
-  const CoordBBox nodes(tokenCoord(frame.bounds.min(), level),
-                        tokenCoord(frame.bounds.max(), level));
-  const int side = 1 << level;
+  const CoordBBox nodes = nodesIn(frame.bounds, level);
   std::vector<std::vector<Coord>> rows(size_t(nodes.dim().x()));
   tbb::parallel_for(size_t(0), rows.size(), [&](size_t x) {
     const openvdb::tree::ValueAccessor<const MaskTree, false> cells(mask);
@@ -58,9 +56,11 @@ TokenMask readTokenMask(const std::string& path, const VoxelFrame& frame, int le
     for (int y = nodes.min().y(); y <= nodes.max().y(); ++y)
       for (int z = nodes.min().z(); z <= nodes.max().z(); ++z) {
         const Coord node(nodes.min().x() + int(x), y, z);
-        bool any = false;
-        for (int v = 0; v < side * side * side && !any; ++v) any = inside(voxelOf(node, side, v));
-        if (any) rows[x].push_back(node);
+        for (auto voxel = voxelsIn(node, level).begin(); voxel; ++voxel)
+          if (inside(*voxel)) {
+            rows[x].push_back(node);
+            break;
+          }
       }
   });
   TokenMask tokens;

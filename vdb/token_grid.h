@@ -44,6 +44,19 @@ inline Coord tokenCoord(const Coord& ijk, int level) {
   return Coord(ijk.x() >> level, ijk.y() >> level, ijk.z() >> level);
 }
 
+/// The first (lowest) voxel of a node of `level`. (Shifting negative numbers left is undefined.)
+inline Coord firstVoxel(const Coord& node, int level) {
+  return Coord(node.x() * (1 << level), node.y() * (1 << level), node.z() * (1 << level));
+}
+/// The voxels of a node of `level`.
+inline CoordBBox voxelsIn(const Coord& node, int level) {
+  return CoordBBox::createCube(firstVoxel(node, level), 1 << level);
+}
+/// The nodes of `level` that a box of voxels touches.
+inline CoordBBox nodesIn(const CoordBBox& voxels, int level) {
+  return CoordBBox(tokenCoord(voxels.min(), level), tokenCoord(voxels.max(), level));
+}
+
 /// Slot 0..7 of a child in its parent: (x & 1) << 2 | (y & 1) << 1 | (z & 1), the offset of
 /// OpenVDB's own 2^3 nodes.
 inline int childSlot(const Coord& ijk) {
@@ -54,10 +67,18 @@ inline Coord childCoord(const Coord& parent, int slot) {
                parent.z() * 2 + (slot & 1));
 }
 
-/// Voxel number `v`, 0 to side^3 - 1, of a node that is `side` voxels wide.
-inline Coord voxelOf(const Coord& node, int side, int v) {
-  return Coord(node.x() * side + v / (side * side), node.y() * side + v / side % side,
-               node.z() * side + v % side);
+/// Whether any, or every, voxel of a node of `level` is active in `mask`, a tree or an accessor.
+template <typename Mask>
+bool anyVoxelOn(const Mask& mask, const Coord& node, int level) {
+  for (auto voxel = voxelsIn(node, level).begin(); voxel; ++voxel)
+    if (mask.isValueOn(*voxel)) return true;
+  return false;
+}
+template <typename Mask>
+bool allVoxelsOn(const Mask& mask, const Coord& node, int level) {
+  for (auto voxel = voxelsIn(node, level).begin(); voxel; ++voxel)
+    if (!mask.isValueOn(*voxel)) return false;
+  return true;
 }
 
 /// Rows of all tokens of a voxel topology and the maps between levels. Rows of each level are in

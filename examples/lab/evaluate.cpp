@@ -96,7 +96,7 @@ void addVoxelsOfNode(const Coord& node, std::vector<Coord>* voxels) {
 // Every unobserved node of the volume takes the colour of the nearest observed voxel. The nearest
 // one is found by growing from the observed nodes, ring by ring.
 MethodOutput nearestFill(const MethodOutput& observed, const SceneVoxels& seen,
-                         const NodeStates& states) {
+                         const SeenSpace& states) {
   MethodOutput out = observed;
   std::map<Coord, Eigen::Vector3f> colour;
   for (size_t i = 0; i < seen.ijk.size(); ++i) {
@@ -122,10 +122,9 @@ MethodOutput nearestFill(const MethodOutput& observed, const SceneVoxels& seen,
       ring.push_back(node);
     }
   }
-  for (auto node = states.box.begin(); node; ++node) {
-    if (states.at(*node) != NodeState::kUnobserved) continue;
-    addNode(seen.frame, *node, colour.at(*node), &out.gaussians);
-    addVoxelsOfNode(*node, &out.voxels);
+  for (const Coord& node : unobservedNodes(states, states.box)) {
+    addNode(seen.frame, node, colour.at(node), &out.gaussians);
+    addVoxelsOfNode(node, &out.voxels);
   }
   return out;
 }
@@ -133,7 +132,7 @@ MethodOutput nearestFill(const MethodOutput& observed, const SceneVoxels& seen,
 // Floor, ceiling and walls fitted to what was seen (the box of the seen voxels, a half per cent
 // trimmed at each side); its unobserved nodes take the mean colour.
 MethodOutput manhattanBox(const MethodOutput& observed, const SceneVoxels& seen,
-                          const NodeStates& states) {
+                          const SeenSpace& states) {
   MethodOutput out = observed;
   Coord lo, hi;
   for (int axis = 0; axis < 3; ++axis) {
@@ -187,10 +186,10 @@ void measurePictures(const EvaluationScene& scene, const Gaussians& gaussians, c
 
 // The nodes of level 1 that count: of a scene with truth, those that were unobserved.
 struct UnseenNodes {
-  const NodeStates& states;
+  const SeenSpace& states;
   std::set<Coord> truth, shell, furniture;  // what surfaces pass: shell, and the rest
 
-  UnseenNodes(const EvaluationScene& scene, const VoxelFrame& frame, const NodeStates& node_states)
+  UnseenNodes(const EvaluationScene& scene, const VoxelFrame& frame, const SeenSpace& node_states)
       : states(node_states) {
     if (!scene.truth) return;
     shell = of(surfaceNodes(*scene.shell, frame, 1));
@@ -396,7 +395,7 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   const double completed_seconds = secondsSince(start);
   const double completed_rss = peakMemoryMb();
   const VoxelFrame& frame = place.frame;
-  const NodeStates states = poolStates(frame, *place.seen, 1);
+  const SeenSpace states = poolSeen(*place.seen, 1);
   const UnseenNodes unseen(scene, frame, states);
 
   std::vector<MethodResult> results;

@@ -174,13 +174,10 @@ Gaussians optimised(const Gaussians& start, const std::vector<View>& views,
 SetScores splitScores(const TriangleMesh& truth, const Observation& o,
                       const std::vector<Coord>& voxels, int level) {
   openvdb::tree::ValueAccessor<const TokenMask> empty(o.seen->empty);
-  const int side = 1 << level;
   const auto unseen = [&](const Coord& child) {
     if (o.tokens.row(level + 1, tokenCoord(child, 1)) < 0 || o.tokens.row(level, child) >= 0)
       return false;
-    for (int v = 0; v < side * side * side; ++v)
-      if (!empty.isValueOn(voxelOf(child, side, v))) return true;
-    return false;
+    return !allVoxelsOn(empty, child, level);
   };
   std::set<Coord> surface, filled;
   for (const Coord& child : surfaceNodes(truth, o.frame, level))

@@ -54,13 +54,12 @@ CompletionSample completionSample(const Encoder& encoder, uint64_t seed, int cho
   const Observation sparse = observe(few, settings, silent);
   settings.frame = sparse.frame;
   const Observation dense = observe(views, settings, silent);
-  CompletionSample s;
-  s.condition = encoder.encode(few, sparse, silent);
-  s.target = encoder.encode(views, dense, silent);
-  s.seen_nodes = poolStates(sparse.frame, *sparse.seen, 1),
-  s.seen_coarse = poolStates(sparse.frame, *sparse.seen, 2);
-  s.target_nodes = poolStates(sparse.frame, *dense.seen, 1),
-  s.target_coarse = poolStates(sparse.frame, *dense.seen, 2);
+  const CompletionSample s{encoder.encode(few, sparse, silent),
+                           encoder.encode(views, dense, silent),
+                           poolSeen(*sparse.seen, 1),
+                           poolSeen(*sparse.seen, 2),
+                           poolSeen(*dense.seen, 1),
+                           poolSeen(*dense.seen, 2)};
   fs::create_directories(sample_folder);
   writeSample(s, path);
   return s;

@@ -219,6 +219,7 @@ RoomTruth roomTruth(const Room& room, float voxel_m) {
   for (int level = 0; level < kTokenLevels; ++level)
     truth.surface_nodes[size_t(level)] =
         clipped(surfaceNodes(solid, truth.frame, level), truth.frame.bounds, level);
+  truth.space.box = truth.frame.bounds;
   for (const Coord& c : truth.surface_nodes[0]) truth.space.filled.setValueOn(c);
   std::vector<Coord> seeds;
   for (const Vector3f& p : freePoints(room, kSeeds, 0)) {

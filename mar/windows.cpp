@@ -1,0 +1,71 @@
+#include "mar/windows.h"
+
+#include <algorithm>
+#include <cmath>
+#include <set>
+
+#include "vdb/token_grid.h"
+
+namespace vdbc {
+
+Windows::Windows(const VoxelFrame& whole, const CompleterConfig& config) : whole_(whole) {
+  constexpr int kCoarse = 1 << (kTokenLevels - 1);  // voxels: no window cuts a coarse node
+  const double extent_m = double(config.positions.extent_m),
+               overlap_m = double(config.window_overlap_m);
+  overlap_ = int(std::lround(overlap_m / whole.voxel_m / kCoarse)) * kCoarse;
+  for (int axis = 0; axis < 3; ++axis) {
+    const int begin = whole.bounds.min()[axis], side = whole.bounds.dim()[axis];
+    const double side_m = side * double(whole.voxel_m);
+    const int parts = side_m <= extent_m ? 1 : int(std::ceil(side_m / (extent_m - 2 * overlap_m)));
+    for (int part = 0; part < parts; ++part)
+      begin_[size_t(axis)].push_back(
+          part ? (begin + int(int64_t(side) * part / parts)) & ~(kCoarse - 1) : begin);
+  }
+}
+
+Window Windows::window(size_t number) const {
+  Window w{{}, whole_};
+  for (int axis = 2; axis >= 0; --axis) {
+    const std::vector<int>& begin = begin_[size_t(axis)];
+    const size_t part = number % begin.size();
+    number /= begin.size();
+    w.core.min()[axis] = begin[part];
+    w.core.max()[axis] = part + 1 < begin.size() ? begin[part + 1] - 1 : whole_.bounds.max()[axis];
+  }
+  w.frame.bounds = w.core;
+  w.frame.bounds.expand(overlap_);
+  w.frame.bounds.intersect(whole_.bounds);
+  return w;
+}
+
+size_t Windows::at(const Coord& voxel) const {
+  size_t number = 0;
+  for (int axis = 0; axis < 3; ++axis) {
+    const std::vector<int>& begin = begin_[size_t(axis)];
+    const auto after = std::upper_bound(begin.begin() + 1, begin.end(), voxel[axis]);
+    number = number * begin.size() + size_t(after - begin.begin() - 1);
+  }
+  return number;
+}
+
+size_t Windows::of(const Coord& node, int level) const { return at(firstVoxel(node, level)); }
+
+std::vector<size_t> Windows::around(const std::vector<Coord>& nodes, int level) const {
+  std::set<size_t> numbers;
+  for (const Coord& node : nodes) {
+    const Coord voxel = firstVoxel(node, level);
+    // An overlap is shorter than a window: these reach every window that is near enough.
+    for (int x : {-overlap_, 0, overlap_})
+      for (int y : {-overlap_, 0, overlap_})
+        for (int z : {-overlap_, 0, overlap_}) numbers.insert(at(voxel.offsetBy(x, y, z)));
+  }
+  return {numbers.begin(), numbers.end()};
+}
+
+std::map<size_t, std::vector<Coord>> Windows::split(const std::vector<Coord>& tokens) const {
+  std::map<size_t, std::vector<Coord>> parts;
+  for (const Coord& token : tokens) parts[of(token, 1)].push_back(token);
+  return parts;
+}
+
+}  // namespace vdbc
