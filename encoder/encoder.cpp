@@ -105,7 +105,7 @@ std::vector<float> Encoder::colourWay() const {
 
 LatentGrid Encoder::encode(const std::vector<View>& views, const Observation& o,
                            Progress& progress) const {
-  torch::NoGradGuard no_grad;
+  const Inference inference;
   report(progress, -1);
   const EncoderConfig& c = config();
   // Rounded as files hold them: what is decoded or completed now is what a file would give.
@@ -156,7 +156,7 @@ void copyToWorld(const GaussianTensors& t, const VoxelFrame& frame, size_t first
 
 DecodedGrid Encoder::decode(const LatentGrid& latents, const ObservedSpace& seen,
                             float child_threshold, Progress& progress) const {
-  torch::NoGradGuard no_grad;
+  const Inference inference;
   const EncoderConfig& c = config();
   require(latents.dim == c.latent_dim && latents.level == c.levels,
           "Encoder::decode: the latent grid: expected ", c.latent_dim, " channels at level ",

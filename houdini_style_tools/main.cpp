@@ -1,7 +1,6 @@
 // vdb_complete: verbs, options and exit codes.
-#include <ATen/Parallel.h>
 #include <malloc.h>
-#include <tbb/global_control.h>
+#include <tbb/task_arena.h>
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
@@ -9,7 +8,6 @@
 #include <cstdio>
 #include <filesystem>
 #include <nlohmann/json.hpp>
-#include <thread>
 
 #include "encoder/encoder_train.h"
 #include "houdini_style_tools/blas.h"
@@ -22,6 +20,7 @@
 #include "houdini_style_tools/scores.h"
 #include "vdb/latent_vdb.h"
 #include "vdb/mask_vdb.h"
+#include "vdb/threads.h"
 
 namespace vdbc {
 namespace {
@@ -446,10 +445,14 @@ void cookDecode(const Decode& o, const Common& common, Progress& progress) {
                         " s\n", stem, ".vdb  ", stem, ".points.vdb  ", stem, ".ply"));
 }
 
-void cookInfo(const Common& common, int threads) {
+void cookInfo(const Common& common) {
   const BlasInfo blas = blasInfo(true);
-  ordered_json j{{"version", VDBC_VERSION},      {"blas", blas.library}, {"core", blas.core},
-                 {"blas_threads", blas.threads}, {"threads", threads},   {"gflops", blas.gflops}};
+  ordered_json j{{"version", VDBC_VERSION},
+                 {"blas", blas.library},
+                 {"core", blas.core},
+                 {"blas_threads", blas.threads},
+                 {"threads", tbb::this_task_arena::max_concurrency()},
+                 {"gflops", blas.gflops}};
   std::string weights;
   try {
     weights = weightsFolder("");
@@ -1059,35 +1062,33 @@ int run(int argc, char** argv) {
     if (e.get_exit_code() == 0) return app.exit(e);  // --help, --version
     throw UsageError(joinText(e.what(), " (vdb_complete --help)"));
   }
-  const int threads =
-      common.threads ? common.threads : int(std::max(1u, std::thread::hardware_concurrency()));
-  const tbb::global_control limit(tbb::global_control::max_allowed_parallelism, size_t(threads));
-  at::set_num_threads(threads);
   Console console(common.json);
-  if (info->parsed()) {
-    cookInfo(common, threads);
-  } else if (verb_encode->parsed()) {
-    cookEncode(encode, common, console);
-  } else if (verb_decode->parsed()) {
-    cookDecode(decode, common, console);
-  } else if (verb_rethreshold->parsed()) {
-    cookRethreshold(rethreshold, common, console);
-  } else if (verb_render->parsed()) {
-    cookRender(render, common, console);
-  } else if (verb_check->parsed()) {
-    cookCheck(check, common);
-  } else if (verb_eval->parsed()) {
-    (evaluate.reconstruct ? cookReconstruct : cookEvaluate)(evaluate, eval_options, common,
-                                                            console);
-  } else if (train_encoder->parsed()) {
-    cookTrainEncoder(train, common, console);
-  } else if (train_mar->parsed()) {
-    cookTrainMar(train, common, console);
-  } else if (complete.views.empty() || complete.output.empty()) {
-    throw UsageError("expected VIEWS and -o X.vdb, or a verb (vdb_complete --help)");
-  } else {
-    cookComplete(complete, common, console);
-  }
+  withThreads(common.threads, [&] {
+    if (info->parsed()) {
+      cookInfo(common);
+    } else if (verb_encode->parsed()) {
+      cookEncode(encode, common, console);
+    } else if (verb_decode->parsed()) {
+      cookDecode(decode, common, console);
+    } else if (verb_rethreshold->parsed()) {
+      cookRethreshold(rethreshold, common, console);
+    } else if (verb_render->parsed()) {
+      cookRender(render, common, console);
+    } else if (verb_check->parsed()) {
+      cookCheck(check, common);
+    } else if (verb_eval->parsed()) {
+      (evaluate.reconstruct ? cookReconstruct : cookEvaluate)(evaluate, eval_options, common,
+                                                              console);
+    } else if (train_encoder->parsed()) {
+      cookTrainEncoder(train, common, console);
+    } else if (train_mar->parsed()) {
+      cookTrainMar(train, common, console);
+    } else if (complete.views.empty() || complete.output.empty()) {
+      throw UsageError("expected VIEWS and -o X.vdb, or a verb (vdb_complete --help)");
+    } else {
+      cookComplete(complete, common, console);
+    }
+  });
   return 0;
 }
 
@@ -1095,7 +1096,7 @@ int run(int argc, char** argv) {
 }  // namespace vdbc
 
 int main(int argc, char** argv) {
-  vdbc::chooseBlasCore();
+  vdbc::setUpProcess();
   // Tensors of some megabytes come and go: keep their pages instead of asking the kernel each time.
   mallopt(M_MMAP_THRESHOLD, 1 << 30);
   mallopt(M_TRIM_THRESHOLD, 1 << 30);
