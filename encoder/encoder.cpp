@@ -45,7 +45,7 @@ std::vector<float> Encoder::colourWay() const {
 
 Place Encoder::encode(const std::vector<View>& views, const Observation& o,
                       Progress& progress) const {
-  torch::NoGradGuard no_grad;
+  const Inference inference;
   report(progress, -1);
   const EncoderConfig& c = config();
   // Rounded as files hold them: what is decoded or completed now is what a file would give.
@@ -96,7 +96,7 @@ void copyToWorld(const GaussianTensors& t, const VoxelFrame& frame, size_t first
 }  // namespace
 
 DecodedGrid Encoder::decode(const Place& place, float child_threshold, Progress& progress) const {
-  torch::NoGradGuard no_grad;
+  const Inference inference;
   const EncoderConfig& c = config();
   require(place.dim == c.latent_dim && place.level == c.levels,
           "Encoder::decode: the place: expected ", c.latent_dim, " channels at level ", c.levels,

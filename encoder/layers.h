@@ -1,6 +1,6 @@
 #pragma once
 // Private: transformer layers shared by encoder/ and mar/, and the only place (with
-// rasterize_torch.h) that includes torch. This header is precompiled.
+// rasterize_torch.h and inference.h) that includes torch. This header is precompiled.
 #include <torch/nn/module.h>
 #include <torch/nn/modules/activation.h>
 #include <torch/nn/modules/container/modulelist.h>
@@ -9,6 +9,7 @@
 #include <torch/nn/modules/normalization.h>
 #include <torch/types.h>
 
+#include "encoder/inference.h"
 #include "encoder/positions.h"
 #include "vdb/frame.h"
 #include "vdb/token_grid.h"

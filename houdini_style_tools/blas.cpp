@@ -1,5 +1,6 @@
 #include "houdini_style_tools/blas.h"
 
+#include <ATen/Parallel.h>
 #include <dlfcn.h>
 
 #include <algorithm>
@@ -37,9 +38,7 @@ int coreVectorBits(const std::string& core) {
   return 0;
 }
 
-}  // namespace
-
-void chooseBlasCore() {
+void chooseCore() {
 #if defined(__x86_64__)
   if (const char* chosen = std::getenv("OPENBLAS_CORETYPE"); chosen && *chosen) return;
   // OpenBLAS reads the variable when the library loads, before any code of ours; its own dispatcher
@@ -62,6 +61,14 @@ void chooseBlasCore() {
 #endif
 }
 
+}  // namespace
+
+void setUpProcess() {
+  at::set_num_threads(1);
+  if (const auto set = symbol<void(int)>("openblas_set_num_threads")) set(1);
+  chooseCore();
+}
+
 BlasInfo blasInfo(bool measure) {
   using Sgemm =
       void(const char*, const char*, const int*, const int*, const int*, const float*, const float*,
@@ -76,7 +83,7 @@ BlasInfo blasInfo(bool measure) {
   // OpenBLAS may be loaded for LAPACK only: then its core says nothing about this library.
   const bool openblas = info.library.find("openblas") != std::string::npos;
   if (openblas) info.core = coreName();
-  // The OpenMP build follows torch's thread count (one pool for both); others have their own.
+  // The OpenMP build follows the calling thread's count; others have their own.
   constexpr int kOpenMp = 2;
   const auto parallel = symbol<int()>("openblas_get_parallel");
   const auto threads = !openblas ? nullptr

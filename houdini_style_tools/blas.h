@@ -4,12 +4,19 @@
 
 namespace vdbc {
 
-/// OpenBLAS picks its kernels from a list of CPU models; one that is newer than the library may get
-/// those of a CPU without AVX (measured: 5 times slower). Where the CPU can do more than the
-/// kernels that were picked, picks SKYLAKEX (AVX-512) or HASWELL (AVX2) instead. Leaves alone: a
-/// user's OPENBLAS_CORETYPE, a good choice, other libraries. Takes microseconds. Call it first in
-/// main(): no matrix product may be running.
-void chooseBlasCore();
+/// What torch and OpenBLAS offer for a whole process only. Call it first in main(): nothing of
+/// either may be running. A host that has decided about them leaves it out: our inference then
+/// still computes the same, with one thread a task, but maybe with slower kernels.
+/// - One thread for each of their operations, whichever thread asks: TBB's tasks run side by side
+///   instead. Torch and an OpenBLAS of OpenMP then start no thread; an OpenBLAS of pthreads has
+///   started its own when it was loaded (OPENBLAS_NUM_THREADS=1 prevents that), and they sleep.
+/// - OpenBLAS's kernels. It picks them from a list of CPU models; one that is newer than the
+/// library
+///   may get those of a CPU without AVX (measured: 5 times slower). Where the CPU can do more than
+///   the kernels that were picked, picks SKYLAKEX (AVX-512) or HASWELL (AVX2) instead, by
+///   OPENBLAS_CORETYPE. Leaves alone: a user's choice in that variable, a good choice, other
+///   libraries.
+void setUpProcess();
 
 struct BlasInfo {
   std::string library;           // file that torch's sgemm_ comes from

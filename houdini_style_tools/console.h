@@ -9,7 +9,8 @@
 namespace vdbc {
 
 /// Draws one line per stage on stderr where that is a terminal; with `json` writes one JSON object
-/// a line to stderr instead. wasInterrupted() turns true after SIGINT or SIGTERM.
+/// a line to stderr instead. wasInterrupted() turns true after SIGINT or SIGTERM; a second one ends
+/// the process at once, with code 130.
 class Console : public Progress {
  public:
   /// Installs the signal handlers (once per process is enough).

@@ -1,6 +1,5 @@
 // vdb_complete: verbs, options and exit codes.
-#include <ATen/Parallel.h>
-#include <tbb/global_control.h>
+#include <tbb/task_arena.h>
 
 #include <algorithm>
 #include <cmath>
@@ -18,6 +17,7 @@
 #include "vdb/latent_vdb.h"
 #include "vdb/mask_vdb.h"
 #include "vdb/process.h"
+#include "vdb/threads.h"
 
 namespace vdbc {
 namespace {
@@ -327,10 +327,14 @@ void cookDecode(const Decode& o, const Common& common, Progress& progress) {
                         " s\n", stem, ".vdb  ", stem, ".points.vdb  ", stem, ".ply"));
 }
 
-void cookInfo(const Common& common, int threads) {
+void cookInfo(const Common& common) {
   const BlasInfo blas = blasInfo(true);
-  ordered_json j{{"version", VDBC_VERSION},      {"blas", blas.library}, {"core", blas.core},
-                 {"blas_threads", blas.threads}, {"threads", threads},   {"gflops", blas.gflops}};
+  ordered_json j{{"version", VDBC_VERSION},
+                 {"blas", blas.library},
+                 {"core", blas.core},
+                 {"blas_threads", blas.threads},
+                 {"threads", tbb::this_task_arena::max_concurrency()},
+                 {"gflops", blas.gflops}};
   std::string weights;
   try {
     weights = weightsFolder("");
@@ -556,27 +560,26 @@ int run(int argc, char** argv) {
     if (e.get_exit_code() == 0) return app.exit(e);  // --help, --version
     throw UsageError(joinText(e.what(), " (vdb_complete --help)"));
   }
-  const int threads = threadCount(common);
-  const tbb::global_control limit(tbb::global_control::max_allowed_parallelism, size_t(threads));
-  at::set_num_threads(threads);
   Console console(common.json);
-  if (info->parsed()) {
-    cookInfo(common, threads);
-  } else if (verb_encode->parsed()) {
-    cookEncode(encode, common, console);
-  } else if (verb_decode->parsed()) {
-    cookDecode(decode, common, console);
-  } else if (verb_rethreshold->parsed()) {
-    cookRethreshold(rethreshold, common, console);
-  } else if (verb_render->parsed()) {
-    cookRender(render, common, console);
-  } else if (verb_check->parsed()) {
-    cookCheck(check, common);
-  } else if (complete.views.empty() || complete.output.empty()) {
-    throw UsageError("expected VIEWS and -o X.vdb, or a verb (vdb_complete --help)");
-  } else {
-    cookComplete(complete, common, console);
-  }
+  withThreads(common.threads, [&] {
+    if (info->parsed()) {
+      cookInfo(common);
+    } else if (verb_encode->parsed()) {
+      cookEncode(encode, common, console);
+    } else if (verb_decode->parsed()) {
+      cookDecode(decode, common, console);
+    } else if (verb_rethreshold->parsed()) {
+      cookRethreshold(rethreshold, common, console);
+    } else if (verb_render->parsed()) {
+      cookRender(render, common, console);
+    } else if (verb_check->parsed()) {
+      cookCheck(check, common);
+    } else if (complete.views.empty() || complete.output.empty()) {
+      throw UsageError("expected VIEWS and -o X.vdb, or a verb (vdb_complete --help)");
+    } else {
+      cookComplete(complete, common, console);
+    }
+  });
   return 0;
 }
 

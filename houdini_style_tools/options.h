@@ -7,7 +7,6 @@
 #include <filesystem>
 #include <sstream>
 #include <string>
-#include <thread>
 #include <vector>
 
 #include "houdini_style_tools/blas.h"
@@ -187,13 +186,9 @@ inline void addCompletion(CLI::App* app, Complete* o) {
                 "let the completer rewrite observed latents");
 }
 
-inline int threadCount(const Common& c) {
-  return c.threads ? c.threads : int(std::max(1u, std::thread::hardware_concurrency()));
-}
-
 // Runs a program; its exit code.
 inline int runProgram(const char* name, int run(int, char**), int argc, char** argv) {
-  chooseBlasCore();
+  setUpProcess();
   // Tensors of some megabytes come and go: keep their pages instead of asking the kernel each time.
   mallopt(M_MMAP_THRESHOLD, 1 << 30);
   mallopt(M_TRIM_THRESHOLD, 1 << 30);

@@ -49,7 +49,7 @@ class Blas : public testing::Test {
 TEST_F(Blas, SlowKernelsAreReplacedByThoseTheCpuCanRun) {
   ASSERT_EQ(blasInfo(false).core, "Prescott");
   unsetenv("OPENBLAS_CORETYPE");
-  chooseBlasCore();
+  setUpProcess();
 #if defined(__x86_64__)
   const char* expected = __builtin_cpu_supports("avx512bw") ? "SkylakeX"
                          : __builtin_cpu_supports("avx2")   ? "Haswell"
@@ -60,7 +60,7 @@ TEST_F(Blas, SlowKernelsAreReplacedByThoseTheCpuCanRun) {
 }
 
 TEST_F(Blas, TheUsersChoiceStays) {
-  chooseBlasCore();  // OPENBLAS_CORETYPE says PRESCOTT
+  setUpProcess();  // OPENBLAS_CORETYPE says PRESCOTT
   EXPECT_EQ(blasInfo(false).core, "Prescott");
   EXPECT_LT(productError(), 1e-4f);
 }
@@ -70,7 +70,7 @@ TEST_F(Blas, AGoodChoiceStays) {
   startWith("COOPERLAKE");
   const std::string core = blasInfo(false).core;
   unsetenv("OPENBLAS_CORETYPE");
-  chooseBlasCore();
+  setUpProcess();
   EXPECT_EQ(blasInfo(false).core, core);
 }
 

@@ -1,6 +1,4 @@
 // vdb_lab: training, and studies of what was trained.
-#include <ATen/Parallel.h>
-#include <tbb/global_control.h>
 
 #include <algorithm>
 #include <cmath>
@@ -13,6 +11,7 @@
 #include "houdini_style_tools/console.h"
 #include "houdini_style_tools/options.h"
 #include "mar/completer_train.h"
+#include "vdb/threads.h"
 
 namespace vdbc {
 namespace {
@@ -360,16 +359,14 @@ int run(int argc, char** argv) {
     if (e.get_exit_code() == 0) return app.exit(e);  // --help
     throw UsageError(joinText(e.what(), " (vdb_lab --help)"));
   }
-  const int threads = threadCount(common);
-  const tbb::global_control limit(tbb::global_control::max_allowed_parallelism, size_t(threads));
-  at::set_num_threads(threads);
   Console console(common.json);
-  if (verb_eval->parsed()) {
-    (evaluate.reconstruct ? cookReconstruct : cookEvaluate)(evaluate, eval_options, common,
-                                                            console);
-  } else {
-    (train_encoder->parsed() ? cookTrainEncoder : cookTrainMar)(train, common, console);
-  }
+  withThreads(common.threads, [&] {
+    if (verb_eval->parsed())
+      (evaluate.reconstruct ? cookReconstruct : cookEvaluate)(evaluate, eval_options, common,
+                                                              console);
+    else
+      (train_encoder->parsed() ? cookTrainEncoder : cookTrainMar)(train, common, console);
+  });
   return 0;
 }
 
