@@ -4,7 +4,6 @@
 #include <string>
 
 #include "encoder/observation.h"
-#include "splat/gaussian_io.h"
 #include "splat/gaussians.h"
 #include "vdb/place.h"
 
