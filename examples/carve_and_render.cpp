@@ -21,7 +21,7 @@ int main(int argc, char** argv) try {
   const CarveSettings carving;
   Progress silent;
   const VoxelFrame frame = fitVolume(depths, volume, carving);
-  const ObservedSpace space = carve(frame, depths, carving, silent);
+  const SeenSpace space = carve(frame, depths, carving, silent);
   std::printf("%llu voxels filled, %llu seen empty\n",
               static_cast<unsigned long long>(space.filled.activeVoxelCount()),
               static_cast<unsigned long long>(space.empty.activeVoxelCount()));
