@@ -5,7 +5,6 @@
 
 #include "encoder/config.h"
 #include "encoder/observation.h"
-#include "splat/gaussian_io.h"
 #include "splat/gaussians.h"
 #include "vdb/place.h"
 

@@ -7,6 +7,7 @@
 
 #include "encoder/network.h"
 #include "encoder/trainer.h"
+#include "splat/image_files.h"
 #include "splat/rasterize_torch.h"
 
 namespace vdbc {

@@ -2,6 +2,7 @@
 // siblings.
 #include <cstdio>
 
+#include "encoder/views/read_views.h"
 #include "houdini_style_tools/complete.h"
 
 int main(int argc, char** argv) try {

@@ -13,13 +13,14 @@ as_root() {
   fi
 }
 
-# Installs what .ci/packages names and is not there (Debian).
+# Installs what the given lists, or else .ci/packages, name and is not there (Debian).
 install_packages() {
+  [ $# -gt 0 ] || set -- "$root/.ci/packages"
   if ! command -v dpkg-query >/dev/null; then
-    echo "setup: not a Debian system: expecting what .ci/packages names to be there" >&2
+    echo "setup: not a Debian system: expecting what $* names to be there" >&2
     return 0
   fi
-  wanted=$(cat "$root/.ci/packages")
+  wanted=$(cat "$@")
   # shellcheck disable=SC2016,SC2086  # dpkg-query's own variables; one word per package
   there=$(dpkg-query -W -f '${db:Status-Abbrev}${Package}\n' $wanted 2>/dev/null | sed -n 's/^ii *//p')
   missing=

@@ -6,6 +6,8 @@
 #include <filesystem>
 #include <functional>
 
+#include "splat/image_files.h"
+#include "splat/ply.h"
 #include "splat/rasterize.h"
 #include "vdb/latent_vdb.h"
 

@@ -6,6 +6,7 @@
 
 #include "encoder/encoder.h"
 #include "mar/completer.h"
+#include "splat/points_vdb.h"
 #include "vdb/scene_vdb.h"
 
 namespace vdbc {

@@ -7,13 +7,14 @@
 #include <filesystem>
 #include <nlohmann/json.hpp>
 
+#include "encoder/views/read_views.h"
 #include "houdini_style_tools/blas.h"
 #include "houdini_style_tools/checkpoint.h"
 #include "houdini_style_tools/complete.h"
 #include "houdini_style_tools/console.h"
 #include "houdini_style_tools/options.h"
 #include "houdini_style_tools/render.h"
-#include "splat/embree_check.h"
+#include "splat/rays.h"
 #include "vdb/latent_vdb.h"
 #include "vdb/mask_vdb.h"
 #include "vdb/process.h"

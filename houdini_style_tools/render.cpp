@@ -6,7 +6,11 @@
 #include <filesystem>
 #include <numeric>
 
+#include "encoder/views/read_views.h"
 #include "houdini_style_tools/complete.h"
+#include "splat/exr.h"
+#include "splat/image_files.h"
+#include "splat/ply.h"
 #include "splat/rasterize.h"
 #include "splat/view.h"
 

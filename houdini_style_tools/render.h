@@ -5,7 +5,7 @@
 #include <string>
 #include <vector>
 
-#include "splat/gaussian_io.h"
+#include "splat/points_vdb.h"
 #include "vdb/camera.h"
 #include "vdb/progress.h"
 

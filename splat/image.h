@@ -1,7 +1,6 @@
 #pragma once
-// Float images, their files (PNG, JPEG, EXR) and the metrics PSNR and SSIM.
-#include <cstdint>
-#include <string>
+// Float images and the metrics PSNR and SSIM.
+#include <cstddef>
 #include <vector>
 
 namespace vdbc {
@@ -22,19 +21,13 @@ struct Image {
   }
 };
 
+/// Throws Error, opened by `operation`, unless the image has pixels and as many values as they
+/// need.
+void requireImage(const char* operation, const Image& image);
+
 /// IEC 61966-2-1 transfer, per value; linear 0-1 <-> display 0-1 (extended linearly below 0).
 float srgbFromLinear(float linear);
 float linearFromSrgb(float srgb);
-
-/// 8- or 16-bit PNG or 8-bit JPEG as values 0-1 (no transfer applied): 1, 3 channels (alpha
-/// dropped). Throws Error on missing, corrupt or oversized files (more than 2^28 pixels).
-Image readImage(const std::string& path);
-/// 16-bit greyscale PNG as raw integers (depth in millimetres, say). Throws Error.
-std::vector<uint16_t> readPng16(const std::string& path, int* width, int* height);
-/// Clamps to 0-1 and rounds to 8 bits; 1 or 3 channels. Temporary name, then rename. Throws Error.
-void writePng(const Image& image, const std::string& path);
-/// 16-bit greyscale PNG of raw integers, [height * width].
-void writePng16(const std::vector<uint16_t>& data, int width, int height, const std::string& path);
 
 /// Area-averaging when shrinking, bilinear when growing.
 Image resizeImage(const Image& image, int width, int height);

@@ -13,6 +13,7 @@
 #include <thread>
 
 #include "splat/image.h"
+#include "splat/image_files.h"
 #include "vdb/error.h"
 
 namespace vdbc {

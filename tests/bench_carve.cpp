@@ -8,6 +8,7 @@
 #include <filesystem>
 #include <string>
 
+#include "encoder/views/read_views.h"
 #include "splat/view.h"
 #include "vdb/carve.h"
 

@@ -7,6 +7,7 @@
 
 #include <set>
 
+#include "encoder/views/read_views.h"
 #include "encoder/weights.h"
 #include "houdini_style_tools/complete.h"
 #include "mar/network.h"

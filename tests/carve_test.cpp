@@ -12,6 +12,7 @@
 #include <random>
 #include <set>
 
+#include "encoder/views/read_views.h"
 #include "splat/view.h"
 #include "vdb/error.h"
 

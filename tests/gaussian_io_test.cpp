@@ -1,5 +1,3 @@
-#include "splat/gaussian_io.h"
-
 #include <gtest/gtest.h>
 #include <unistd.h>
 
@@ -14,6 +12,8 @@
 #include <random>
 
 #include "splat/image.h"
+#include "splat/ply.h"
+#include "splat/points_vdb.h"
 #include "splat/rasterize.h"
 #include "vdb/error.h"
 

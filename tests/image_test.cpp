@@ -12,6 +12,7 @@
 #include <limits>
 #include <random>
 
+#include "splat/image_files.h"
 #include "vdb/error.h"
 
 namespace vdbc {

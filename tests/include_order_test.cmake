@@ -55,11 +55,13 @@ if(SELF_TEST)
     "houdini_style_tools/a.cpp|examples/lab/evaluate.h" "examples/rooms/a.cpp|examples/lab/scenes.h" "mar/a.h|torch/torch.h"
     "tests/a_test.cpp|torch/torch.h" "examples/rooms/rooms.h|encoder/encoder.h"
     "encoder/a.h|houdini_style_tools/blas.h" "encoder/views/a.cpp|encoder/encoder.h" "splat/a.cpp|encoder/views/view.h"
-    "splat/a.h|openvdb/openvdb.h")
+    "splat/a.h|openvdb/openvdb.h" "encoder/views/a.h|ATen/ATen.h"
+    "encoder/views/a.cpp|splat/rasterize_torch.h" "encoder/views/a.cpp|examples/rooms/rooms.h")
   set(good "vdb/a.h|vdb/error.h" "splat/a.cpp|vdb/camera.h" "splat/rasterize_torch.cpp|ATen/ATen.h"
     "encoder/a.cpp|splat/rasterize_torch.h" "mar/a.cpp|encoder/layers.h" "vdb/a.cpp|openvdb/openvdb.h"
     "examples/lab/a.cpp|examples/rooms/rooms.h" "examples/lab/a.cpp|houdini_style_tools/complete.h" "tests/a_test.cpp|mar/heads.h"
-    "examples/rooms/a.cpp|encoder/views/view.h" "encoder/a.h|encoder/views/view.h")
+    "examples/rooms/a.cpp|encoder/views/view.h" "encoder/a.h|encoder/views/view.h"
+    "encoder/views/a.cpp|splat/view.h")
   foreach(case ${bad} ${good})
     string(REPLACE "|" ";" parts "${case}")
     list(GET parts 0 file)

@@ -20,10 +20,14 @@
 #include <thread>
 #include <vector>
 
-#include "splat/gaussian_io.h"
+#include "encoder/views/read_views.h"
+#include "splat/image_files.h"
+#include "splat/ply.h"
+#include "splat/points_vdb.h"
 #include "splat/rasterize.h"
 #include "splat/view.h"
 #include "tests/simple_room.h"
+#include "tests/view_files.h"
 #include "vdb/error.h"
 #include "vdb/latent_vdb.h"
 #include "vdb/scene_vdb.h"

@@ -13,7 +13,12 @@
 #include <map>
 #include <random>
 
+#include "encoder/views/read_views.h"
 #include "houdini_style_tools/render.h"
+#include "splat/exr.h"
+#include "splat/image_files.h"
+#include "splat/ply.h"
+#include "splat/points_vdb.h"
 #include "splat/rasterize.h"
 #include "splat/view.h"
 

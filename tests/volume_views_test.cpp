@@ -14,7 +14,8 @@
 #include <set>
 #include <tuple>
 
-#include "splat/embree_check.h"
+#include "encoder/views/read_views.h"
+#include "splat/rays.h"
 #include "splat/view.h"
 #include "tests/vdb_files.h"
 #include "vdb/fit_volume.h"

@@ -7,9 +7,11 @@
 #include <numeric>
 #include <random>
 
+#include "encoder/views/read_views.h"
 #include "examples/lab/scenes.h"
 #include "examples/lab/scores.h"
 #include "examples/rooms/rooms.h"
+#include "splat/image_files.h"
 #include "splat/metrics.h"
 #include "splat/rasterize.h"
 #include "vdb/process.h"

@@ -11,7 +11,7 @@
 
 #include "examples/lab/perceptual.h"
 #include "houdini_style_tools/complete.h"
-#include "splat/embree_check.h"
+#include "splat/rays.h"
 
 namespace vdbc {
 

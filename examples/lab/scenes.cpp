@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <filesystem>
 
+#include "encoder/views/read_views.h"
+
 namespace vdbc {
 
 namespace fs = std::filesystem;

@@ -21,8 +21,8 @@
 #include <tuple>
 #include <unordered_map>
 
+#include "encoder/views/zip_file.h"
 #include "splat/image.h"
-#include "splat/zip_file.h"
 #include "vdb/error.h"
 #include "vdb/file_io.h"
 

@@ -14,7 +14,10 @@
 #include <string>
 #include <vector>
 
+#include "encoder/views/read_views.h"
 #include "examples/rooms/rooms.h"
+#include "splat/exr.h"
+#include "splat/image_files.h"
 #include "vdb/error.h"
 #include "vdb/file_io.h"
 #include "vdb/progress.h"

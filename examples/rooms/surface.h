@@ -6,7 +6,7 @@
 #include <string>
 #include <vector>
 
-#include "splat/embree_check.h"
+#include "splat/rays.h"
 
 namespace vdbc {
 

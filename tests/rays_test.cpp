@@ -1,5 +1,5 @@
 // The ray caster against closed forms, and carve() against the ray caster (spec A1).
-#include "splat/embree_check.h"
+#include "splat/rays.h"
 
 #include <gtest/gtest.h>
 

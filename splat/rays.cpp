@@ -1,4 +1,4 @@
-#include "splat/embree_check.h"
+#include "splat/rays.h"
 
 #include <embree3/rtcore.h>
 #include <tbb/blocked_range.h>

@@ -4,8 +4,8 @@
 #include <filesystem>
 #include <optional>
 
-#include "splat/npz.h"
-#include "splat/view_reading.h"
+#include "encoder/views/npz.h"
+#include "encoder/views/view_reading.h"
 
 namespace vdbc {
 namespace {

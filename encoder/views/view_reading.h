@@ -6,7 +6,7 @@
 #include <string>
 #include <vector>
 
-#include "splat/view.h"
+#include "encoder/views/read_views.h"
 #include "vdb/error.h"
 
 namespace vdbc {
@@ -49,7 +49,19 @@ std::vector<View> readAll(const std::vector<size_t>& frames, const ReadOne& read
   return views;
 }
 
-/// Views of an .npz (pointmap.cpp; docs/formats.md).
+/// One or three channels as three.
+Image threeChannels(Image image);
+
+/// Views of a transforms.json (transforms_json.cpp).
+std::vector<View> readTransforms(const std::string& path, const ReadViewsSettings& settings);
+/// +Z of the file's frame in the frame before its applied_transform.
+Eigen::Vector3d transformsUp(const std::string& path);
+
+/// The view of one EXR file, named `name` (exr_views.cpp).
+View readExrView(const std::string& path, const std::string& name,
+                 const ReadViewsSettings& settings);
+
+/// Views of an .npz (pointmaps.cpp; docs/formats.md).
 std::vector<View> readPointmaps(const std::string& path, const ReadViewsSettings& settings);
 /// Mean of the cameras' up axes.
 Eigen::Vector3d pointmapUp(const std::string& path);

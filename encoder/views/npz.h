@@ -5,7 +5,7 @@
 #include <string>
 #include <vector>
 
-#include "splat/zip_file.h"
+#include "encoder/views/zip_file.h"
 
 namespace vdbc {
 

@@ -1,4 +1,4 @@
-#include "splat/zip_file.h"
+#include "encoder/views/zip_file.h"
 
 #include <zip.h>
 

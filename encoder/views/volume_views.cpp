@@ -16,7 +16,7 @@
 #include <random>
 #include <set>
 
-#include "splat/view_reading.h"
+#include "encoder/views/view_reading.h"
 #include "vdb/fit_volume.h"
 #include "vdb/vdb_file.h"
 

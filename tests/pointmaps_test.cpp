@@ -9,8 +9,10 @@
 #include <cstring>
 #include <map>
 
+#include "encoder/views/read_views.h"
 #include "splat/view.h"
 #include "tests/files.h"
+#include "tests/view_files.h"
 #include "vdb/error.h"
 
 namespace vdbc {

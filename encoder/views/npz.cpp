@@ -1,4 +1,4 @@
-#include "splat/npz.h"
+#include "encoder/views/npz.h"
 
 #include <half.h>
 
