@@ -1,5 +1,6 @@
 #include "encoder/encoder.h"
 
+#include <atomic>
 #include <cmath>
 
 #include "encoder/network.h"
@@ -151,17 +152,18 @@ DecodedGrid Encoder::decode(const Place& place, float child_threshold, Progress&
   }
   // Some voxels at a time: with hundreds of Gaussians a voxel the last layer's output is many times
   // the result.
-  constexpr int64_t kChunk = 4096;
+  constexpr int64_t kPiece = 4096;
   const int64_t voxels = int64_t(coords.size()), m = c.gaussians_per_voxel;
   const Tensor all_coords = coordTensor(coords);
   out.gaussians.resize(voxels * m, 0);
-  for (int64_t begin = 0; begin < voxels; begin += kChunk) {
-    const int64_t end = std::min(voxels, begin + kChunk);
+  std::atomic<int64_t> done{0};
+  inTasks((voxels + kPiece - 1) / kPiece, [&](int64_t piece) {
+    const int64_t begin = piece * kPiece, end = std::min(voxels, begin + kPiece);
     copyToWorld(impl_->net->gaussians(tokens.rows(begin, end), all_coords.slice(0, begin, end),
                                       place.frame.voxel_m),
                 place.frame, size_t(begin * m), &out.gaussians);
-    report(progress, int(100 * end / voxels));
-  }
+    report(progress, int(100 * (done += end - begin) / voxels));
+  });
   out.voxels = std::move(coords), out.node = std::move(node);
   out.child_probability = std::move(probability);
   return out;

@@ -18,7 +18,9 @@ struct DecodedGrid {
   Gaussians gaussians;                   // [V * M] world frame, SH degree 0
 };
 
-/// Trained networks, loaded once. Thread-safe for concurrent const calls is not promised.
+/// Trained networks, loaded once. Const functions may be called from several threads at once. They
+/// run in parallel in the caller's task arena (vdb/threads.h); the same bytes for any number of
+/// threads.
 class Encoder {
  public:
   /// Throws Error if the file is missing, corrupt or of another kind.

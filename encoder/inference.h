@@ -3,10 +3,13 @@
 // piece torch and BLAS run in the thread that calls them. With threads of their own they would meet
 // at a barrier in every small operation and, wherever another program takes a core, spin there.
 #include <ATen/core/grad_mode.h>
+#include <ATen/ops/cat.h>
+#include <ATen/ops/slice.h>
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
 
 #include <cstdint>
+#include <vector>
 
 namespace vdbc {
 
@@ -31,9 +34,14 @@ struct Inference {
 
 /// Runs piece(0) to piece(count - 1) as tasks of the current arena, each in Inference. For the same
 /// bytes on any number of threads pieces are cut by sizes of the work alone, draw from random
-/// generators of their own and write to places of their own.
+/// generators of their own and write to places of their own. Where gradients are wanted, one after
+/// the other in this thread.
 template <typename Piece>
 void inTasks(int64_t count, const Piece& piece) {
+  if (at::GradMode::is_enabled()) {
+    for (int64_t i = 0; i < count; ++i) piece(i);
+    return;
+  }
   tbb::parallel_for(
       tbb::blocked_range<int64_t>(0, count),
       [&](const tbb::blocked_range<int64_t>& range) {
@@ -41,6 +49,26 @@ void inTasks(int64_t count, const Piece& piece) {
         for (int64_t i = range.begin(); i < range.end(); ++i) piece(i);
       },
       tbb::simple_partitioner());
+}
+
+/// Rows [begin, end); the tensor itself where those are all: autograd would copy a slice's
+/// gradient.
+inline at::Tensor rowsOf(const at::Tensor& t, int64_t begin, int64_t end) {
+  return begin == 0 && end == t.size(0) ? t : t.slice(0, begin, end);
+}
+
+/// [n, ...] of rows that do not depend on each other: rows(begin, end) makes some of them. Blocks
+/// of at least 256 rows are tasks.
+template <typename Rows>
+at::Tensor inRowBlocks(int64_t n, const Rows& rows) {
+  constexpr int64_t kRows = 256;
+  const int64_t blocks = n / kRows;
+  if (blocks < 2 || at::GradMode::is_enabled()) return rows(int64_t(0), n);
+  std::vector<at::Tensor> parts(static_cast<size_t>(blocks));
+  inTasks(blocks, [&](int64_t b) {
+    parts[size_t(b)] = rows(b * kRows, b + 1 == blocks ? n : (b + 1) * kRows);
+  });
+  return at::cat(parts);
 }
 
 }  // namespace vdbc

@@ -111,61 +111,22 @@ Tensor splitHeads(const Tensor& x, int heads) {  // [N, C] -> [H, N, C / H]
 }
 }  // namespace
 
-Tensor Attention::attend(const Tensor& q_rows, const Tensor& k_rows, const Tensor& v_rows,
-                         const Rotary* q_pos, const Rotary* k_pos) const {
-  Tensor q = splitHeads(q_rows, heads), k = splitHeads(k_rows, heads),
-         v = splitHeads(v_rows, heads);
-  if (q_pos) q = rotate(q, *q_pos);
-  if (k_pos) k = rotate(k, *k_pos);
-  const double scale = 1 / std::sqrt(double(q.size(2)));
-  const Tensor a = torch::matmul(q * scale, k.transpose(1, 2)).softmax(-1);
-  return torch::matmul(a, v).transpose(0, 1).reshape({q_rows.size(0), q_rows.size(1)});
+Attention::Context Attention::contextOf(const Tensor& rows, const Rotary* pos) {
+  const auto through = [&](Linear& layer) {
+    return inRowBlocks(rows.size(0), [&](int64_t begin, int64_t end) {
+      return layer->forward(rowsOf(rows, begin, end));
+    });
+  };
+  const Tensor keys = splitHeads(through(key), heads);
+  return {pos ? rotate(keys, *pos) : keys, through(value)};
 }
 
-Tensor Attention::forward(const Tensor& x, const Tensor& context, const Rotary* x_pos,
-                          const Rotary* context_pos) {
-  return output->forward(attend(query->forward(x), key->forward(context), value->forward(context),
-                                x_pos, context_pos));
-}
-
-Tensor Attention::windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,
-                           bool shifted) {
-  const int64_t n = x.size(0), width = x.size(1);
-  if (n <= window) return forward(x, x, pos, pos);
-  // Rows in curve order; a shifted layer starts half a window earlier, so its first and last
-  // windows are half empty. Places without a token are masked.
-  const int64_t lead = shifted ? window / 2 : 0;
-  const int64_t windows = (n + lead + window - 1) / window;
-  const int64_t tail = windows * window - lead - n;
-  auto toWindows = [&](const Tensor& rows) {  // [N, C] -> [windows * H, window, C / H]
-    const Tensor padded = torch::constant_pad_nd(rows, {0, 0, lead, tail});
-    return padded.view({windows, window, heads, -1})
-        .transpose(1, 2)
-        .reshape({windows * heads, window, -1});
-  };
-  const Tensor sorted = x.index_select(0, order);
-  auto headed = [&](const Tensor& rows) {
-    if (!pos) return rows;
-    const Rotary p = pos->select(order);
-    return rotate(splitHeads(rows, heads), p).transpose(0, 1).reshape({n, width});
-  };
-  const Tensor q = toWindows(headed(query->forward(sorted)));
-  const Tensor k = toWindows(headed(key->forward(sorted)));
-  const Tensor v = toWindows(value->forward(sorted));
-  Tensor blocked = torch::zeros({windows, 1, 1, window});
-  if (lead) blocked.index_put_({0, 0, 0, torch::arange(lead)}, -1e9f);
-  if (tail) blocked.index_put_({windows - 1, 0, 0, torch::arange(window - tail, window)}, -1e9f);
+Tensor Attention::attend(const Tensor& x, const Rotary* pos, const Context& context) {
+  Tensor q = splitHeads(query->forward(x), heads);
+  if (pos) q = rotate(q, *pos);
   const double scale = 1 / std::sqrt(double(q.size(2)));
-  Tensor a = torch::matmul(q * scale, k.transpose(1, 2)).view({windows, heads, window, window});
-  a = (a + blocked).softmax(-1).view({windows * heads, window, window});
-  const Tensor out = torch::matmul(a, v)
-                         .view({windows, heads, window, -1})
-                         .transpose(1, 2)
-                         .reshape({windows * window, width})
-                         .slice(0, lead, lead + n);
-  Tensor inverse = torch::empty_like(order);
-  inverse.index_put_({order}, torch::arange(n));
-  return output->forward(out.index_select(0, inverse));
+  const Tensor a = torch::matmul(q * scale, context.keys.transpose(1, 2)).softmax(-1);
+  return torch::matmul(a, splitHeads(context.values, heads)).transpose(0, 1).reshape(x.sizes());
 }
 
 Mlp::Mlp(int in, int hidden, int out) {
@@ -180,10 +141,31 @@ SelfBlock::SelfBlock(int width, int heads) {
   mlp = register_module("mlp", std::make_shared<Mlp>(width, 4 * width, width));
 }
 
-Tensor SelfBlock::forward(Tensor x, const Rotary* pos, const Tensor& order, int window,
-                          bool shifted) {
-  x = x + attention->windowed(norm1->forward(x), pos, order, window, shifted);
-  return x + mlp->forward(norm2->forward(x));
+Tensor SelfBlock::forward(const Tensor& x, const Rotary* pos) {
+  const Tensor normed = norm1->forward(x);
+  const Attention::Context context = attention->contextOf(normed, pos);
+  return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
+    const Rotary p = pos ? pos->slice(begin, end) : Rotary();
+    const Tensor y = rowsOf(x, begin, end) +
+                     attention->forward(rowsOf(normed, begin, end), pos ? &p : nullptr, context);
+    return y + mlp->forward(norm2->forward(y));
+  });
+}
+
+Tensor SelfBlock::windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,
+                           bool shifted) {
+  const int64_t n = x.size(0), lead = shifted ? window / 2 : 0;
+  if (n <= window) return forward(x, pos);
+  std::vector<Tensor> parts(size_t((n + lead + window - 1) / window));
+  inTasks(int64_t(parts.size()), [&](int64_t i) {
+    const int64_t begin = i * window - lead;
+    const Tensor rows = order.slice(0, std::max<int64_t>(0, begin), std::min(n, begin + window));
+    const Rotary p = pos ? pos->select(rows) : Rotary();
+    parts[size_t(i)] = forward(x.index_select(0, rows), pos ? &p : nullptr);
+  });
+  Tensor inverse = torch::empty_like(order);
+  inverse.index_put_({order}, torch::arange(n));
+  return torch::cat(parts).index_select(0, inverse);
 }
 
 void initialiseXavier(nn::Module& module) {

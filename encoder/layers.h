@@ -32,6 +32,9 @@ struct Rotary {
   Rotary select(const Tensor& rows) const {
     return {cos.index_select(0, rows), sin.index_select(0, rows)};
   }
+  Rotary slice(int64_t begin, int64_t end) const {
+    return {rowsOf(cos, begin, end), rowsOf(sin, begin, end)};
+  }
 };
 Rotary rotary(const Tensor& coords, int head_dim, const PositionConfig& config);
 
@@ -68,45 +71,57 @@ struct LinearImpl : torch::nn::LinearImpl {
 };
 TORCH_MODULE(Linear);
 
-/// Multi-head attention with separate q, k, v and output projections.
+/// Multi-head attention with separate q, k, v and output projections. Rotary positions may be null.
 struct Attention : torch::nn::Module {
   Attention(int width, int heads);
-  /// Queries [N, C], keys and values from [M, C]; rotary positions may be empty. Returns [N, C].
-  Tensor forward(const Tensor& x, const Tensor& context, const Rotary* x_pos = nullptr,
-                 const Rotary* context_pos = nullptr);
-  /// Self-attention of [N, C] within windows of `window` tokens consecutive in `order` (Z-order),
-  /// every second layer shifted by half a window. Full attention where N <= window.
-  Tensor windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,
-                  bool shifted);
+  /// What queries look at.
+  struct Context {
+    Tensor keys;    // [H, M, C / H]
+    Tensor values;  // [M, C]
+  };
+  Context contextOf(const Tensor& rows, const Rotary* pos);
+  /// Queries from [N, C]. Returns [N, C], before the output projection.
+  Tensor attend(const Tensor& x, const Rotary* pos, const Context& context);
+  /// The same, projected.
+  Tensor forward(const Tensor& x, const Rotary* pos, const Context& context) {
+    return output->forward(attend(x, pos, context));
+  }
   /// alpha * attention + (1 - alpha) * guide, mixed before the output projection; `guide` maps
   /// values [M, C] to [N, C] (spec E7).
   template <typename Guide>
-  Tensor guided(const Tensor& x, const Tensor& context, const Tensor& alpha, const Guide& guide) {
-    const Tensor v = value->forward(context);
-    return output->forward(
-        alpha * attend(query->forward(x), key->forward(context), v, nullptr, nullptr) +
-        (1 - alpha) * guide(v));
+  Tensor guided(const Tensor& x, const Tensor& rows, const Tensor& alpha, const Guide& guide) {
+    const Context context = contextOf(rows, nullptr);
+    const Tensor given = guide(context.values);
+    return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
+      return output->forward(alpha * attend(rowsOf(x, begin, end), nullptr, context) +
+                             (1 - alpha) * rowsOf(given, begin, end));
+    });
   }
 
   int heads;
   Linear query{nullptr}, key{nullptr}, value{nullptr}, output{nullptr};
-
- private:
-  Tensor attend(const Tensor& q, const Tensor& k, const Tensor& v, const Rotary* q_pos,
-                const Rotary* k_pos) const;
 };
 
 /// Linear, GELU, linear.
 struct Mlp : torch::nn::Module {
   Mlp(int in, int hidden, int out);
-  Tensor forward(const Tensor& x) { return second->forward(torch::gelu(first->forward(x))); }
+  Tensor forward(const Tensor& x) {
+    return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
+      return second->forward(torch::gelu(first->forward(rowsOf(x, begin, end))));
+    });
+  }
   Linear first{nullptr}, second{nullptr};
 };
 
-/// Pre-norm transformer block: self-attention (windowed, rotary) and MLP.
+/// Pre-norm transformer block: self-attention (rotary) and MLP.
 struct SelfBlock : torch::nn::Module {
   SelfBlock(int width, int heads);
-  Tensor forward(Tensor x, const Rotary* pos, const Tensor& order, int window, bool shifted);
+  /// All N tokens look at each other.
+  Tensor forward(const Tensor& x, const Rotary* pos);
+  /// Within windows of `window` tokens consecutive in `order` (Z-order), where `shifted` from half
+  /// a window on, as every second block is. One window where N <= window.
+  Tensor windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,
+                  bool shifted);
   torch::nn::LayerNorm norm1{nullptr}, norm2{nullptr};
   std::shared_ptr<Attention> attention;
   std::shared_ptr<Mlp> mlp;

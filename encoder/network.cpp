@@ -52,15 +52,15 @@ namespace {
 
 // Patches of all views, [P, 3 * px * px], about unit deviation.
 Tensor patchPixels(const std::vector<View>& views, const Observation& o, int px) {
-  std::vector<Tensor> all;
-  for (size_t i = 0; i < views.size(); ++i) {
-    const PatchLattice& l = o.lattices[i];
-    const Image image = resizeImage(views[i].colour, l.columns * px, l.rows * px);
+  std::vector<Tensor> all(views.size());
+  inTasks(int64_t(views.size()), [&](int64_t i) {
+    const PatchLattice& l = o.lattices[size_t(i)];
+    const Image image = resizeImage(views[size_t(i)].colour, l.columns * px, l.rows * px);
     const Tensor t =
         torch::from_blob(const_cast<float*>(image.data.data()), {l.rows, px, l.columns, px, 3});
-    all.push_back((t.permute({0, 2, 1, 3, 4}).reshape({l.rows * l.columns, px * px * 3}) - .5f) *
-                  4);
-  }
+    all[size_t(i)] =
+        (t.permute({0, 2, 1, 3, 4}).reshape({l.rows * l.columns, px * px * 3}) - .5f) * 4;
+  });
   return torch::cat(all);
 }
 
@@ -149,11 +149,11 @@ void BidirectionalBlock::forward(Tensor* x3, Tensor* x2, const EncoderInput& in,
                                  int layer) {
   *x3 = *x3 + cross3->guided(norm3->forward(*x3), context2->forward(*x2), share(),
                              [&](const Tensor& v) { return in.voxels_from_patches.apply(v); });
-  *x3 = self3->forward(*x3, &pos, in.order, config.window, layer % 2 == 1);
+  *x3 = self3->windowed(*x3, &pos, in.order, config.window, layer % 2 == 1);
   if (!self2) return;
   *x2 = *x2 + cross2->guided(norm2->forward(*x2), context3->forward(*x3), share(),
                              [&](const Tensor& v) { return in.patches_from_voxels.apply(v); });
-  *x2 = self2->forward(*x2, nullptr, {}, int(x2->size(0)), false);  // full: views have no order
+  *x2 = self2->forward(*x2, nullptr);  // full: views have no order
 }
 
 EncoderNet::EncoderNet(const EncoderConfig& c) : config(c) {
@@ -267,7 +267,7 @@ DecoderTokens EncoderNet::decodeTokens(const Tensor& z, const Tensor& coords, co
   Tensor x = latent_in->forward(z);
   const Rotary pos = rotary(coords, config.width / config.heads, config.positions);
   for (size_t b = 0; b < decoder_blocks.size(); ++b)
-    x = decoder_blocks[b]->forward(x, &pos, order, config.window, b % 2 == 1);
+    x = decoder_blocks[b]->windowed(x, &pos, order, config.window, b % 2 == 1);
   return {decoder_norm->forward(x), colour_shortcut->forward(z).view({-1, 8, 3})};
 }
 
@@ -278,7 +278,9 @@ Tensor EncoderNet::childLogits(const DecoderTokens& tokens, int split) {
 DecoderTokens EncoderNet::splitTokens(const DecoderTokens& tokens, const Split& s, int split) {
   const Tensor rows = s.parent * 8 + s.slot;
   const Tensor features =
-      child_tokens[size_t(split)]->forward(tokens.features).view({tokens.features.size(0) * 8, -1});
+      inRowBlocks(tokens.features.size(0), [&](int64_t begin, int64_t end) {
+        return child_tokens[size_t(split)]->forward(rowsOf(tokens.features, begin, end));
+      }).view({tokens.features.size(0) * 8, -1});
   const Tensor colours = tokens.colours.reshape({-1, 1, 3}).index_select(0, rows);
   return {features.index_select(0, rows), colours.expand({-1, 8, 3})};
 }

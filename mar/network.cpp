@@ -45,14 +45,12 @@ MaskedTransformer::Output MaskedTransformer::forward(const TokenSets& inputs, in
   const Rotary pos = rotary(all_coords, sizes.width / sizes.heads, positions);
   const int64_t context = all_coords.size(0) - coords[kTarget].size(0);
   const Rotary context_pos{pos.cos.slice(0, 0, context), pos.sin.slice(0, 0, context)};
-  constexpr int kFull = 1 << 30;  // full attention: one window holds everything
   Output out;
   Tensor x = torch::cat({tokens[kCondition], tokens[kVisible], tokens[kEmptyToken]});
-  for (auto& block : h1)
-    x = block->forward(x, rotary_positions ? &context_pos : nullptr, {}, kFull, false);
+  for (auto& block : h1) x = block->forward(x, rotary_positions ? &context_pos : nullptr);
   out.context = x;
   x = torch::cat({x, tokens[kTarget]});
-  for (auto& block : h2) x = block->forward(x, rotary_positions ? &pos : nullptr, {}, kFull, false);
+  for (auto& block : h2) x = block->forward(x, rotary_positions ? &pos : nullptr);
   out.tokens = out_norm->forward(x);
   return out;
 }
