@@ -60,11 +60,11 @@ const Growth& bundledGrowth() {
     const torch::NoGradGuard no_grad;
     Progress silent;
     const Encoder encoder(kWeights + "/encoder.safetensors");
-    const Encoding e =
+    const Place place =
         encodeScene(readViews(VDBC_SOURCE_DIR "/examples/two_views"), encoder, {}, silent);
-    const VoxelFrame& frame = e.latents.frame;
-    const SceneTokens scene = sceneTokens(poolStates(frame, e.observation.space, 1),
-                                          poolStates(frame, e.observation.space, 2));
+    const VoxelFrame& frame = place.frame;
+    const SceneTokens scene =
+        sceneTokens(poolStates(frame, *place.seen, 1), poolStates(frame, *place.seen, 2));
     std::map<Coord, float> gate;
     for (const Coord& c : scene.coarse_filled) gate[c] = 1;
     network().coarseProbabilities(scene, scene.coarse_unknown, frame, &gate);
@@ -73,7 +73,7 @@ const Growth& bundledGrowth() {
       if (probability > CompleteSettings().coarse_tau) open.push_back(node);
     Growth g;
     g.candidates = unobservedChildren(open, scene.nodes);
-    g.levels = breadthFirstLevels(g.candidates, e.latents.ijk);
+    g.levels = breadthFirstLevels(g.candidates, place.ijk);
     return g;
   }();
   return growth;

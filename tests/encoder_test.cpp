@@ -71,11 +71,12 @@ VoxelFrame frameOf(const std::vector<View>& views, float voxel_m) {
 
 Observation observed(const std::vector<View>& views, const VoxelFrame& frame,
                      const EncoderConfig& c) {
-  ObservationSettings settings;
+  ObserveSettings settings;
+  settings.frame = frame;
   settings.patches_across = c.patches_across;
   settings.level = c.levels;
   Progress silent;
-  return observe(views, frame, settings, silent);
+  return observe(views, settings, silent);
 }
 Observation observed(const std::vector<View>& views, const EncoderConfig& c) {
   return observed(views, frameOf(views, c.voxel_m), c);
@@ -578,11 +579,11 @@ TEST_F(EncoderFile, OneSetOfWeightsServesAnyNumberOfViews) {  // E1
   for (size_t n : {1, 2, 4, 8, 12, 16}) {
     const std::vector<View> views = roomViews(n);
     const Observation o = observed(views, encoder.config());
-    const LatentGrid latents = encoder.encode(views, o, silent_);
-    EXPECT_EQ(latents.ijk, o.tokens.coords(1));
-    EXPECT_EQ(int64_t(latents.z.size()), latents.size() * 16);
-    for (float z : latents.z) ASSERT_TRUE(std::isfinite(z));
-    const Gaussians g = encoder.decode(latents, o.space, .5f, silent_).gaussians;
+    const Place place = encoder.encode(views, o, silent_);
+    EXPECT_EQ(place.ijk, o.tokens.coords(1));
+    EXPECT_EQ(int64_t(place.z.size()), place.size() * 16);
+    for (float z : place.z) ASSERT_TRUE(std::isfinite(z));
+    const Gaussians g = encoder.decode(place, .5f, silent_).gaussians;
     requireConsistent(g);
     for (const auto& m : g.mean) ASSERT_TRUE(m.allFinite());
     for (const auto& s : g.log_scale) ASSERT_TRUE(s.allFinite());
@@ -595,8 +596,8 @@ TEST_F(EncoderFile, EncodesConditionAndTargetWithTheSameUnchangedWeights) {  // 
   const std::vector<View> few = roomViews(2), many = roomViews(6);
   const VoxelFrame frame = frameOf(few, encoder.config().voxel_m);
   const Observation sparse = observed(few, frame, encoder.config());
-  const LatentGrid first = encoder.encode(few, sparse, silent_);
-  const LatentGrid dense = encoder.encode(many, observed(many, frame, encoder.config()), silent_);
+  const Place first = encoder.encode(few, sparse, silent_);
+  const Place dense = encoder.encode(many, observed(many, frame, encoder.config()), silent_);
   EXPECT_EQ(encoder.encode(few, sparse, silent_).z, first.z);
   EXPECT_EQ(encoder.hash(), hash);
   EXPECT_EQ(weightsHash(*net_), hash);
@@ -610,28 +611,28 @@ TEST_F(EncoderFile, LoadsExactlyWhatWasSaved) {  // E14
   EXPECT_EQ(encoder.trainedOn(), "rooms:1-2");
   const std::vector<View> views = roomViews(2);
   const Observation o = observed(views, c);
-  const LatentGrid latents = encoder.encode(views, o, silent_);
+  const Place place = encoder.encode(views, o, silent_);
   torch::NoGradGuard no_grad;
   const Tensor z = net_->normalise(net_->encode(encoderInput(views, o, c)).mean)
                        .to(torch::kHalf)
                        .to(torch::kFloat32)
                        .contiguous();
-  ASSERT_EQ(int64_t(latents.z.size()), z.numel());
-  EXPECT_EQ(std::memcmp(latents.z.data(), z.data_ptr(), z.nbytes()), 0);
+  ASSERT_EQ(int64_t(place.z.size()), z.numel());
+  EXPECT_EQ(std::memcmp(place.z.data(), z.data_ptr(), z.nbytes()), 0);
   net_->latent_in->bias[0] += 1;
   EXPECT_NE(weightsHash(*net_), encoder.hash());
 }
 
-/// `grid` and a ring of generated tokens around it.
-LatentGrid withGenerated(LatentGrid grid) {
+/// `place` and a ring of generated tokens around it.
+Place withGenerated(Place place) {
   torch::manual_seed(11);
-  for (const Coord& ijk : neighbourRing(grid.ijk, Neighbours::kFaces6)) {
-    grid.ijk.push_back(ijk);
-    const Tensor z = torch::randn({grid.dim});
-    grid.z.insert(grid.z.end(), z.data_ptr<float>(), z.data_ptr<float>() + grid.dim);
-    grid.observed.push_back(0), grid.probability.push_back(.6f), grid.bfs_level.push_back(1);
+  for (const Coord& ijk : neighbourRing(place.ijk, Neighbours::kFaces6)) {
+    place.ijk.push_back(ijk);
+    const Tensor z = torch::randn({place.dim});
+    place.z.insert(place.z.end(), z.data_ptr<float>(), z.data_ptr<float>() + place.dim);
+    place.generated.push_back(1), place.probability.push_back(.6f), place.bfs_level.push_back(1);
   }
-  return grid;
+  return place;
 }
 
 TEST_F(EncoderFile, DecodesWhatWasSeenExactlyAndNothingIntoSeenAir) {  // E9, E11
@@ -641,32 +642,32 @@ TEST_F(EncoderFile, DecodesWhatWasSeenExactlyAndNothingIntoSeenAir) {  // E9, E1
       const EncoderConfig c = toyConfig(levels);
       const Encoder encoder = encoderOf(c);
       const Observation o = observed(views, c);
-      LatentGrid latents = encoder.encode(views, o, silent_);
-      if (levels > 0) latents = withGenerated(latents);
-      const DecodedGrid d = encoder.decode(latents, o.space, threshold, silent_);
+      Place place = encoder.encode(views, o, silent_);
+      if (levels > 0) place = withGenerated(place);
+      const DecodedGrid d = encoder.decode(place, threshold, silent_);
       const std::set<Coord> voxels(d.voxels.begin(), d.voxels.end());
       EXPECT_EQ(voxels.size(), d.voxels.size()) << "a voxel is decoded twice";
       for (const Coord& ijk : o.tokens.coords(0))
         ASSERT_TRUE(voxels.count(ijk))
             << "levels " << levels << ": lost the observed voxel " << ijk;
-      std::vector<int> children(size_t(latents.size()), 0);
+      std::vector<int> children(size_t(place.size()), 0);
       for (size_t i = 0; i < d.voxels.size(); ++i) {
-        const bool filled = o.space.filled.isValueOn(d.voxels[i]);
-        EXPECT_TRUE(filled || !o.space.empty.isValueOn(d.voxels[i]))
+        const bool filled = o.seen->filled.isValueOn(d.voxels[i]);
+        EXPECT_TRUE(filled || !o.seen->empty.isValueOn(d.voxels[i]))
             << "filled what was seen empty";
-        EXPECT_EQ(tokenCoord(d.voxels[i], levels), latents.ijk[size_t(d.node[i])]);
+        EXPECT_EQ(tokenCoord(d.voxels[i], levels), place.ijk[size_t(d.node[i])]);
         EXPECT_TRUE(!filled || d.child_probability[i] == 1.f);
         ++children[size_t(d.node[i])];
       }
       // A generated token has a voxel unless all of it was seen empty.
       const int side = 1 << levels;
-      for (int64_t t = 0; t < latents.size(); ++t) {
+      for (int64_t t = 0; t < place.size(); ++t) {
         int open = 0;
         for (int v = 0; v < side * side * side; ++v)
           open +=
-              !o.space.empty.isValueOn(Coord(latents.ijk[size_t(t)].x() * side + v / (side * side),
-                                             latents.ijk[size_t(t)].y() * side + v / side % side,
-                                             latents.ijk[size_t(t)].z() * side + v % side));
+              !o.seen->empty.isValueOn(Coord(place.ijk[size_t(t)].x() * side + v / (side * side),
+                                             place.ijk[size_t(t)].y() * side + v / side % side,
+                                             place.ijk[size_t(t)].z() * side + v % side));
         EXPECT_EQ(children[size_t(t)] > 0, open > 0);
       }
       requireConsistent(d.gaussians);
@@ -685,17 +686,17 @@ TEST_F(EncoderFile, LowerThresholdsKeepMore) {  // E9
   const Encoder encoder = encoderOf(c);
   const std::vector<View> views = roomViews(2);
   const Observation o = observed(views, c);
-  const LatentGrid latents = withGenerated(encoder.encode(views, o, silent_));
+  const Place place = withGenerated(encoder.encode(views, o, silent_));
   std::set<Coord> larger;
   for (const float threshold : {0.f, .3f, .5f, .7f, 1.f}) {
-    const DecodedGrid d = encoder.decode(latents, o.space, threshold, silent_);
+    const DecodedGrid d = encoder.decode(place, threshold, silent_);
     const std::set<Coord> kept(d.voxels.begin(), d.voxels.end());
     if (threshold == 0)
-      for (const Coord& node : latents.ijk)
+      for (const Coord& node : place.ijk)
         for (int slot = 0; slot < 8; ++slot) {
           const Coord child = childCoord(node, slot);
           EXPECT_EQ(kept.count(child) > 0,
-                    o.space.filled.isValueOn(child) || !o.space.empty.isValueOn(child));
+                    o.seen->filled.isValueOn(child) || !o.seen->empty.isValueOn(child));
         }
     else
       EXPECT_TRUE(std::includes(larger.begin(), larger.end(), kept.begin(), kept.end()));
@@ -705,11 +706,12 @@ TEST_F(EncoderFile, LowerThresholdsKeepMore) {  // E9
 
 TEST_F(EncoderFile, DecodesNoTokensToNoGaussians) {
   const Encoder encoder = encoderOf(toyConfig());
-  LatentGrid nothing;
+  Place nothing;
+  nothing.seen = std::make_shared<SeenSpace>();
   nothing.dim = 16;
-  EXPECT_EQ(encoder.decode(nothing, SeenSpace(), .5f, silent_).gaussians.size(), 0);
+  EXPECT_EQ(encoder.decode(nothing, .5f, silent_).gaussians.size(), 0);
   nothing.dim = 8;
-  EXPECT_THROW(encoder.decode(nothing, SeenSpace(), .5f, silent_), Error);
+  EXPECT_THROW(encoder.decode(nothing, .5f, silent_), Error);
 }
 
 TEST_F(EncoderFile, BadFilesThrow) {
@@ -989,8 +991,8 @@ TEST(EncoderLoss, SplitTermIsTheCrossEntropyOfWhatIsKnown) {  // E9, E12
   for (int64_t i = 0; i < logits.size(0); ++i)
     for (int slot = 0; slot < 8; ++slot) {
       const Coord child = childCoord(step.o.tokens.coords(1)[size_t(i)], slot);
-      const bool filled = step.o.space.filled.isValueOn(child);
-      if (!filled && !step.o.space.empty.isValueOn(child)) {
+      const bool filled = step.o.seen->filled.isValueOn(child);
+      if (!filled && !step.o.seen->empty.isValueOn(child)) {
         ++unknown;
         continue;
       }

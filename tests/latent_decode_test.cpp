@@ -9,7 +9,6 @@
 #include "encoder/encoder.h"
 #include "tests/files.h"
 #include "tests/simple_room.h"
-#include "vdb/fit_volume.h"
 #include "vdb/latent_vdb.h"
 
 namespace vdbc {
@@ -32,22 +31,18 @@ TEST(LatentDecode, FromTheFileIsFromMemoryByteForByte) {
   const Eigen::Isometry3d turn = Eigen::Translation3d(1.7, -9.3, 4.1) *
                                  Eigen::AngleAxisd(1.1, Eigen::Vector3d(1, -2, .5).normalized());
   for (View& v : views) v.camera.world_from_camera = turn * v.camera.world_from_camera;
-  std::vector<DepthView> depth;
-  for (const View& v : views) depth.push_back(v.depthView());
-  VolumeSettings volume;
-  volume.voxel_m = encoder.config().voxel_m;
-  volume.up = turn.linear() * Eigen::Vector3d::UnitZ();
-  const VoxelFrame frame = fitVolume(depth, volume, {});
-  const Observation o = observe(views, frame, encoder.observationSettings(), silent);
-  LatentGrid latents = encoder.encode(views, o, silent);
-  writeLatentVdb({latents, o.space, encoder.hash(), ""}, folder / "a.latent.vdb");
+  ObserveSettings settings;
+  settings.volume.up = turn.linear() * Eigen::Vector3d::UnitZ();
+  const Observation o = observe(views, encoder.observing(settings), silent);
+  Place place = encoder.encode(views, o, silent);
+  writeLatentVdb(place, folder / "a.latent.vdb");
 
-  for (float& z : latents.z) z = float(openvdb::math::half(z));
-  const DecodedGrid at_once = encoder.decode(latents, o.space, .05f, silent);
+  for (float& z : place.z) z = float(openvdb::math::half(z));
+  const DecodedGrid at_once = encoder.decode(place, .05f, silent);
   ASSERT_GT(at_once.gaussians.size(), 1000);
-  const LatentFile file = readLatentVdb(folder / "a.latent.vdb");
-  EXPECT_EQ(file.encoder_hash, encoder.hash());
-  const DecodedGrid later = encoder.decode(file.latents, file.seen, .05f, silent);
+  const Place read = readLatentVdb(folder / "a.latent.vdb");
+  EXPECT_EQ(read.encoder_hash, encoder.hash());
+  const DecodedGrid later = encoder.decode(read, .05f, silent);
   EXPECT_EQ(later.voxels, at_once.voxels);
   EXPECT_EQ(later.node, at_once.node);
   EXPECT_TRUE(sameBytes(later.child_probability, at_once.child_probability));

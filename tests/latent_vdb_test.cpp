@@ -22,10 +22,9 @@ namespace fs = std::filesystem;
 using PointGrid = openvdb::points::PointDataGrid;
 
 /// A shuffled half of the nodes of a turned volume, observed and generated, with what was seen.
-LatentFile someLatents(int level = 1, int side = 24, int dim = 32) {
-  LatentFile file;
-  file.encoder_hash = "0123456789abcdef";
-  LatentGrid& g = file.latents;
+Place somePlace(int level = 1, int side = 24, int dim = 32) {
+  Place g;
+  g.encoder_hash = "0123456789abcdef", g.growth = "level 3 of a run";
   g.level = level, g.dim = dim;
   g.frame.voxel_m = 0.07f;
   g.frame.world_from_grid.linear() =
@@ -40,19 +39,21 @@ LatentFile someLatents(int level = 1, int side = 24, int dim = 32) {
     if (random() % 2) g.ijk.push_back(ijk);
   std::shuffle(g.ijk.begin(), g.ijk.end(), random);
   for (size_t i = 0; i < g.ijk.size(); ++i) {
-    const bool observed = random() % 3 > 0;
-    g.observed.push_back(observed);
-    g.probability.push_back(observed ? 1.f : .1f + .8f * float(random() % 1000) / 1000);
-    g.bfs_level.push_back(observed ? 0 : 1 + int(random() % 9));
+    const bool generated = random() % 3 == 0;
+    g.generated.push_back(generated);
+    g.probability.push_back(generated ? .1f + .8f * float(random() % 1000) / 1000 : 1.f);
+    g.bfs_level.push_back(generated ? 1 + int(random() % 9) : 0);
     for (int c = 0; c < dim; ++c) g.z.push_back(normal(random) * (c % 3 ? 1.f : 1e-5f));
   }
+  const auto seen = std::make_shared<SeenSpace>();
   for (const Coord& ijk : g.frame.bounds) {
     const unsigned kind = random() % 8;
-    if (kind == 0) file.seen.filled.setValueOn(ijk);
-    if (kind == 1 || ijk.x() < 0) file.seen.empty.setValueOn(ijk);
+    if (kind == 0) seen->filled.setValueOn(ijk);
+    if (kind == 1 || ijk.x() < 0) seen->empty.setValueOn(ijk);
   }
-  file.seen.empty.prune();
-  return file;
+  seen->empty.prune();
+  g.seen = seen;
+  return g;
 }
 
 std::vector<float> inHalf(std::vector<float> values) {
@@ -66,33 +67,33 @@ std::set<Coord> setOf(const TokenMask& mask) {
 }
 
 /// All of it equal bit for bit, but for z, which is `z`.
-void expectSame(const LatentFile& a, const LatentFile& b, const std::vector<float>& z) {
-  const LatentGrid &g = a.latents, &h = b.latents;
-  EXPECT_EQ(a.encoder_hash, b.encoder_hash);
+void expectSame(const Place& g, const Place& h, const std::vector<float>& z) {
+  EXPECT_EQ(g.encoder_hash, h.encoder_hash);
+  EXPECT_EQ(g.growth, h.growth);
   EXPECT_EQ(g.level, h.level);
   EXPECT_EQ(g.dim, h.dim);
   EXPECT_EQ(g.ijk, h.ijk);
   ASSERT_EQ(g.z.size(), z.size());
   EXPECT_TRUE(z.empty() || std::memcmp(g.z.data(), z.data(), z.size() * sizeof(float)) == 0);
-  EXPECT_EQ(g.observed, h.observed);
+  EXPECT_EQ(g.generated, h.generated);
   EXPECT_EQ(g.probability, h.probability);
   EXPECT_EQ(g.bfs_level, h.bfs_level);
   EXPECT_EQ(g.frame.voxel_m, h.frame.voxel_m);
   EXPECT_EQ(g.frame.bounds, h.frame.bounds);
   EXPECT_EQ(g.frame.world_from_grid.matrix(), h.frame.world_from_grid.matrix());
-  EXPECT_EQ(setOf(a.seen.filled), setOf(b.seen.filled));
-  EXPECT_EQ(setOf(a.seen.empty), setOf(b.seen.empty));
+  EXPECT_EQ(setOf(g.seen->filled), setOf(h.seen->filled));
+  EXPECT_EQ(setOf(g.seen->empty), setOf(h.seen->empty));
 }
 
 TEST(LatentVdb, RoundTripIsExactInHalfPrecision) {
   const TemporaryFolder folder;
   for (int level : {0, 1, 2}) {
-    const LatentFile before = someLatents(level);
-    ASSERT_GT(before.latents.size(), 50);
-    const std::vector<float> halves = inHalf(before.latents.z);
-    EXPECT_NE(before.latents.z, halves);
+    const Place before = somePlace(level);
+    ASSERT_GT(before.size(), 50);
+    const std::vector<float> halves = inHalf(before.z);
+    EXPECT_NE(before.z, halves);
     writeLatentVdb(before, folder / "a.vdb");
-    const LatentFile after = readLatentVdb(folder / "a.vdb");
+    const Place after = readLatentVdb(folder / "a.vdb");
     expectSame(after, before, halves);
     writeLatentVdb(after, folder / "b.vdb");
     expectSame(readLatentVdb(folder / "b.vdb"), after, halves);
@@ -102,30 +103,31 @@ TEST(LatentVdb, RoundTripIsExactInHalfPrecision) {
 
 TEST(LatentVdb, LatentsThatAreEqualEverywhereRoundTrip) {  // OpenVDB stores them as one value
   const TemporaryFolder folder;
-  LatentFile before = someLatents();
-  std::fill(before.latents.z.begin(), before.latents.z.end(), .5f);
-  std::fill(before.latents.probability.begin(), before.latents.probability.end(), 1.f);
+  Place before = somePlace();
+  std::fill(before.z.begin(), before.z.end(), .5f);
+  std::fill(before.probability.begin(), before.probability.end(), 1.f);
   writeLatentVdb(before, folder / "a.vdb");
-  expectSame(readLatentVdb(folder / "a.vdb"), before, before.latents.z);
+  expectSame(readLatentVdb(folder / "a.vdb"), before, before.z);
 }
 
 TEST(LatentVdb, NoLatentsRoundTrip) {
   const TemporaryFolder folder;
-  LatentFile before;
-  before.latents.dim = 8;
-  before.latents.frame.bounds = CoordBBox(Coord(0), Coord(3));
+  Place before;
+  before.seen = std::make_shared<SeenSpace>();
+  before.dim = 8;
+  before.frame.bounds = CoordBBox(Coord(0), Coord(3));
   writeLatentVdb(before, folder / "a.vdb");
   expectSame(readLatentVdb(folder / "a.vdb"), before, {});
 }
 
 TEST(LatentVdb, OnePointAtEachNodesCentre) {
   const TemporaryFolder folder;
-  const LatentFile file = someLatents();
-  writeLatentVdb(file, folder / "a.vdb");
+  const Place place = somePlace();
+  writeLatentVdb(place, folder / "a.vdb");
   openvdb::io::File in(folder / "a.vdb");
   in.open(false);
   const auto grid = openvdb::gridPtrCast<PointGrid>(in.readGrid("latent"));
-  std::set<Coord> expected(file.latents.ijk.begin(), file.latents.ijk.end()), found;
+  std::set<Coord> expected(place.ijk.begin(), place.ijk.end()), found;
   for (auto leaf = grid->tree().cbeginLeaf(); leaf; ++leaf) {
     const openvdb::points::AttributeHandle<openvdb::Vec3f> p(leaf->constAttributeArray("P"));
     EXPECT_EQ(leaf->constAttributeArray("z").stride(), 32u);
@@ -136,38 +138,38 @@ TEST(LatentVdb, OnePointAtEachNodesCentre) {
       const openvdb::Vec3d world =
           grid->transform().indexToWorld(ijk.asVec3d() + openvdb::Vec3d(p.get(*point)));
       const Eigen::Vector3d centre =
-          file.latents.frame.toWorld(2 * Eigen::Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5));
+          place.frame.toWorld(2 * Eigen::Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5));
       ASSERT_LT((Eigen::Vector3d(world.x(), world.y(), world.z()) - centre).norm(), 1e-9);
     }
   }
   EXPECT_EQ(found, expected);
-  EXPECT_EQ(grid->metaValue<int64_t>("point_count"), file.latents.size());
+  EXPECT_EQ(grid->metaValue<int64_t>("point_count"), place.size());
 }
 
 TEST(LatentVdb, EveryTruncationThrows) {
   const TemporaryFolder folder;
-  writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");
+  writeLatentVdb(somePlace(1, 8, 4), folder / "a.vdb");
   expectEveryTruncationThrows(folder / "a.vdb", folder / "cut.vdb", 53, readLatentVdb);
 }
 
 TEST(LatentVdb, EveryCorruptionThrows) {
   const TemporaryFolder folder;
-  writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");
+  writeLatentVdb(somePlace(1, 8, 4), folder / "a.vdb");
   expectEveryCorruptionThrows(folder / "a.vdb", folder / "bad.vdb", readLatentVdb);
 }
 
 TEST(LatentVdb, FilesWrittenAgainByOthersAreRead) {
   const TemporaryFolder folder;
-  const LatentFile before = someLatents();
+  const Place before = somePlace();
   writeLatentVdb(before, folder / "a.vdb");
   rewriteVdb(folder / "a.vdb", folder / "b.vdb", [](Grids&, openvdb::MetaMap&) {});
-  expectSame(readLatentVdb(folder / "b.vdb"), before, inHalf(before.latents.z));
+  expectSame(readLatentVdb(folder / "b.vdb"), before, inHalf(before.z));
 }
 
 TEST(LatentVdb, ForeignFilesWithNonsenseThrow) {
   using openvdb::MetaMap;
   const TemporaryFolder folder;
-  writeLatentVdb(someLatents(1, 8, 4), folder / "a.vdb");
+  writeLatentVdb(somePlace(1, 8, 4), folder / "a.vdb");
   const auto rejects = [&](const char* named, auto change) {
     rewriteVdb(folder / "a.vdb", folder / "b.vdb", change);
     try {
@@ -235,28 +237,33 @@ TEST(LatentVdb, ForeignFilesWithNonsenseThrow) {
 TEST(LatentVdb, BadLatentsThrowAndLeaveNothing) {
   const TemporaryFolder folder;
   const auto rejects = [&](auto change) {
-    LatentFile file = someLatents(1, 8, 4);
-    change(file);
-    EXPECT_THROW(writeLatentVdb(file, folder / "a.vdb"), Error);
+    Place place = somePlace(1, 8, 4);
+    change(place);
+    EXPECT_THROW(writeLatentVdb(place, folder / "a.vdb"), Error);
   };
-  rejects([](LatentFile& f) { f.latents.z.pop_back(); });
-  rejects([](LatentFile& f) { f.latents.bfs_level.pop_back(); });
-  rejects([](LatentFile& f) { f.latents.ijk[0] = f.latents.ijk[1]; });
-  rejects([](LatentFile& f) { f.latents.ijk[0] = Coord(1000, 0, 0); });
-  rejects([](LatentFile& f) { f.latents.z[3] = NAN; });
-  rejects([](LatentFile& f) { f.latents.z[3] = 1e6f; });
-  rejects([](LatentFile& f) { f.latents.probability[0] = 2; });
-  rejects([](LatentFile& f) { f.latents.frame.voxel_m = 0; });
-  rejects([](LatentFile& f) { f.latents.level = 3; });
-  rejects([](LatentFile& f) { f.seen.filled.setValueOn(Coord(-9, 0, 0)); });
-  EXPECT_THROW(writeLatentVdb(someLatents(), folder / "no/such/folder/a.vdb"), Error);
+  rejects([](Place& p) { p.z.pop_back(); });
+  rejects([](Place& p) { p.bfs_level.pop_back(); });
+  rejects([](Place& p) { p.generated.pop_back(); });
+  rejects([](Place& p) { p.ijk[0] = p.ijk[1]; });
+  rejects([](Place& p) { p.ijk[0] = Coord(1000, 0, 0); });
+  rejects([](Place& p) { p.z[3] = NAN; });
+  rejects([](Place& p) { p.z[3] = 1e6f; });
+  rejects([](Place& p) { p.probability[0] = 2; });
+  rejects([](Place& p) { p.frame.voxel_m = 0; });
+  rejects([](Place& p) { p.level = 3; });
+  rejects([](Place& p) {
+    const auto seen = std::make_shared<SeenSpace>(*p.seen);
+    seen->filled.setValueOn(Coord(-9, 0, 0));
+    p.seen = seen;
+  });
+  EXPECT_THROW(writeLatentVdb(somePlace(), folder / "no/such/folder/a.vdb"), Error);
   EXPECT_TRUE(fs::is_empty(folder.path));
 }
 
 TEST(LatentVdb, VdbPrintOpensIt) {
   if (!installed("vdb_print")) GTEST_SKIP() << "vdb_print is not installed";
   const TemporaryFolder folder;
-  writeLatentVdb(someLatents(), folder / "a.vdb");
+  writeLatentVdb(somePlace(), folder / "a.vdb");
   const std::string text =
       outputOf("vdb_print -l " + folder / "a.vdb") + outputOf("vdb_print -m " + folder / "a.vdb");
   for (const char* part : {"latent", "ptdataidx32", "filled", "empty", "encoder_hash",
@@ -267,7 +274,7 @@ TEST(LatentVdb, VdbPrintOpensIt) {
 TEST(LatentVdb, BlenderListsItsGrids) {
   if (!installed("blender")) GTEST_SKIP() << "blender is not installed";
   const TemporaryFolder folder;
-  writeLatentVdb(someLatents(), folder / "a.vdb");
+  writeLatentVdb(somePlace(), folder / "a.vdb");
   writeBytes(folder / "look.py", R"(
 import bpy, sys
 bpy.ops.object.volume_import(filepath=sys.argv[-1])
@@ -287,11 +294,11 @@ TEST(LatentVdb, PythonReadsTheVoxelsSeen) {
   if (outputOf("python3 -c 'import pyopenvdb; print(1)'").empty())
     GTEST_SKIP() << "python3-openvdb is not installed";
   const TemporaryFolder folder;
-  const LatentFile file = someLatents();
-  writeLatentVdb(file, folder / "a.vdb");
+  const Place place = somePlace();
+  writeLatentVdb(place, folder / "a.vdb");
   const std::string text = outputOf("python3 -c \"import pyopenvdb; print(pyopenvdb.read('" +
                                     folder / "a.vdb" + "', 'filled').activeVoxelCount())\"");
-  EXPECT_EQ(text, std::to_string(setOf(file.seen.filled).size()) + "\n");
+  EXPECT_EQ(text, std::to_string(setOf(place.seen->filled).size()) + "\n");
 }
 
 }  // namespace

@@ -56,8 +56,8 @@ NodeStates pooled(const NodeStates& fine) {
 
 bool isSolid(const Coord& c) { return c.z() == 1 || c.y() == 9; }
 
-LatentGrid gridOf(const NodeStates& nodes, const VoxelFrame& frame) {
-  LatentGrid g;
+Place gridOf(const NodeStates& nodes, const VoxelFrame& frame) {
+  Place g;
   g.frame = frame, g.dim = kDim;
   for (auto c = nodes.box.begin(); c; ++c) {
     if (nodes.at(*c) != NodeState::kFilled) continue;
@@ -65,7 +65,7 @@ LatentGrid gridOf(const NodeStates& nodes, const VoxelFrame& frame) {
     for (int d = 0; d < kDim; ++d)
       g.z.push_back(std::sin(.3f * float((*c).x() * (d + 1)) + float((*c).z() == 1) * float(d)));
   }
-  g.observed.assign(g.ijk.size(), 1);
+  g.generated.assign(g.ijk.size(), 0);
   g.probability.assign(g.ijk.size(), 1.f);
   g.bfs_level.assign(g.ijk.size(), 0);
   return g;
@@ -91,14 +91,21 @@ CompletionSample toySample(int seen_x = 5) {
   return s;
 }
 
-SeenSpace spaceOf(const NodeStates& nodes) {
-  SeenSpace space;
+std::shared_ptr<const SeenSpace> spaceOf(const NodeStates& nodes) {
+  const auto space = std::make_shared<SeenSpace>();
   for (auto c = nodes.box.begin(); c; ++c)
     for (int slot = 0; slot < 8; ++slot) {
-      if (nodes.at(*c) == NodeState::kFilled) space.filled.setValueOn(childCoord(*c, slot));
-      if (nodes.at(*c) == NodeState::kEmpty) space.empty.setValueOn(childCoord(*c, slot));
+      if (nodes.at(*c) == NodeState::kFilled) space->filled.setValueOn(childCoord(*c, slot));
+      if (nodes.at(*c) == NodeState::kEmpty) space->empty.setValueOn(childCoord(*c, slot));
     }
   return space;
+}
+
+/// The condition with what was seen, as the completer takes it.
+Place startOf(const CompletionSample& sample) {
+  Place start = sample.condition;
+  start.seen = spaceOf(sample.seen_nodes);
+  return start;
 }
 
 CompleterConfig toyConfig() {
@@ -717,7 +724,7 @@ TEST(CompleterStep, GarbageInTheUnobservedChangesNoBit) {  // A1, the paper's op
       if (s.target_nodes.at(*n) == NodeState::kUnobserved) {
         s.target.ijk.push_back(*n);
         s.target.z.insert(s.target.z.end(), kDim, value * float((*n).x() + 1));
-        s.target.observed.push_back(1), s.target.probability.push_back(1),
+        s.target.generated.push_back(0), s.target.probability.push_back(1),
             s.target.bfs_level.push_back(0);
       }
     return s;
@@ -765,8 +772,8 @@ class CompleterFile : public InFolder {
     writeTensors(file, path("completer.safetensors"));
     return Completer(path("completer.safetensors"));
   }
-  LatentGrid complete(const Completer& completer, const CompleteSettings& settings) {
-    return completer.complete(sample_.condition, spaceOf(sample_.seen_nodes), settings, silent_);
+  Place complete(const Completer& completer, const CompleteSettings& settings) {
+    return completer.complete(startOf(sample_), settings, silent_);
   }
   /// The coarse stage's probabilities, from the network itself.
   std::map<Coord, float> gate() const {
@@ -793,18 +800,18 @@ class CompleterFile : public InFolder {
       }
     return nodes;
   }
-  void expectObservedRowsFirst(const LatentGrid& whole) const {
-    const LatentGrid& seen = sample_.condition;
+  void expectObservedRowsFirst(const Place& whole) const {
+    const Place& seen = sample_.condition;
     ASSERT_GE(whole.size(), seen.size());
     ASSERT_EQ(int64_t(whole.z.size()), whole.size() * kDim);
     EXPECT_TRUE(std::equal(seen.ijk.begin(), seen.ijk.end(), whole.ijk.begin()));
     EXPECT_EQ(std::memcmp(seen.z.data(), whole.z.data(), seen.z.size() * sizeof(float)), 0);
     for (int64_t i = 0; i < whole.size(); ++i) {
-      EXPECT_EQ(whole.observed[size_t(i)], i < seen.size());
+      EXPECT_EQ(whole.generated[size_t(i)], i >= seen.size());
       EXPECT_EQ(whole.bfs_level[size_t(i)] == 0, i < seen.size());
     }
   }
-  static void expectNoDuplicates(const LatentGrid& grid) {
+  static void expectNoDuplicates(const Place& grid) {
     EXPECT_EQ(std::set<Coord>(grid.ijk.begin(), grid.ijk.end()).size(), grid.ijk.size());
   }
 
@@ -818,7 +825,7 @@ TEST_F(CompleterFile, ObservedRowsAreUntouchedAndNoNodeComesTwice) {  // A3, A11
   for (const int steps : {0, 4}) {
     CompleteSettings settings;
     settings.sampling_steps = steps, settings.hole_tau = 1;
-    const LatentGrid whole = complete(completer, settings);
+    const Place whole = complete(completer, settings);
     EXPECT_GT(whole.size(), sample_.condition.size());
     expectObservedRowsFirst(whole);
     expectNoDuplicates(whole);
@@ -837,7 +844,7 @@ TEST_F(CompleterFile, VisitsEveryCandidateOnceInBreadthFirstOrder) {  // A10, A1
   settings.tau = 0;  // keeps whatever is visited
   for (const float coarse_tau : {0.f, .5f, .9999f}) {
     settings.coarse_tau = coarse_tau;
-    const LatentGrid whole = complete(completer, settings);
+    const Place whole = complete(completer, settings);
     expectNoDuplicates(whole);
     const std::vector<Coord> open = candidates(coarse_tau);
     EXPECT_EQ(std::set<Coord>(whole.ijk.begin() + sample_.condition.size(), whole.ijk.end()),
@@ -867,7 +874,7 @@ TEST_F(CompleterFile, TheFineStageStaysInsideWhatTheCoarseStageKept) {  // A10
   while (middle + 1 < sorted.size() && sorted[middle + 1] - sorted[middle] < 1e-5f) ++middle;
   ASSERT_LT(middle + 1, sorted.size());
   settings.coarse_tau = .5f * (sorted[middle] + sorted[middle + 1]);
-  const LatentGrid whole = complete(completer, settings);
+  const Place whole = complete(completer, settings);
   int64_t outside_filled = 0;
   for (int64_t i = sample_.condition.size(); i < whole.size(); ++i) {
     EXPECT_GT(open.at(tokenCoord(whole.ijk[size_t(i)], 1)), settings.coarse_tau);
@@ -882,7 +889,7 @@ TEST_F(CompleterFile, WithoutACoarseStageEveryUnobservedNodeIsACandidate) {
   const Completer completer = completerOf(c);
   CompleteSettings settings;
   settings.tau = 0, settings.coarse_tau = .9999f;
-  const LatentGrid whole = complete(completer, settings);
+  const Place whole = complete(completer, settings);
   std::set<Coord> unobserved;
   for (auto node = sample_.seen_nodes.box.begin(); node; ++node)
     if (sample_.seen_nodes.at(*node) == NodeState::kUnobserved) unobserved.insert(*node);
@@ -895,7 +902,7 @@ TEST_F(CompleterFile, RandomOrderHasLevelsOfTheSameSizes) {
   CompleteSettings settings;
   settings.tau = 0, settings.coarse_tau = 0;
   const auto levels = [&] {
-    const LatentGrid whole = complete(completer, settings);
+    const Place whole = complete(completer, settings);
     std::map<Coord, int32_t> level;
     for (size_t i = size_t(sample_.condition.size()); i < whole.ijk.size(); ++i)
       level[whole.ijk[i]] = whole.bfs_level[i];
@@ -923,11 +930,11 @@ TEST_F(CompleterFile, SizesGivenAreThoseOfTheWeightsAtTheirValue) {
   const CompleterConfig c = toyConfig();
   const Completer completer = completerOf(c);
   CompleteSettings settings;
-  const LatentGrid own = complete(completer, settings);
+  const Place own = complete(completer, settings);
   settings.context_tokens = c.context_tokens, settings.chunk_tokens = c.chunk_tokens;
   EXPECT_EQ(complete(completer, settings).probability, own.probability);
   settings.context_tokens = 5;
-  const LatentGrid nearer = complete(completer, settings);
+  const Place nearer = complete(completer, settings);
   EXPECT_NE(nearer.probability, own.probability);
   settings.context_tokens = 0, settings.chunk_tokens = 5;
   EXPECT_NE(complete(completer, settings).probability, own.probability);
@@ -938,7 +945,7 @@ TEST_F(CompleterFile, OnlyGrowthThatSeesWhatItMadeGetsNormalisedLatents) {
   const auto largestMean = [&](bool generated_context) {
     CompleteSettings settings;
     settings.generated_context = generated_context;
-    const LatentGrid whole = complete(completer, settings);
+    const Place whole = complete(completer, settings);
     const Tensor z =
         torch::tensor(whole.z).view({whole.size(), kDim}).slice(0, sample_.condition.size());
     return z.view({-1, kDim / 4, 4}).mean(2).abs().max().item<double>();  // of a channel group;
@@ -959,14 +966,14 @@ TEST_F(CompleterFile, SameSeedSameGrid) {  // A11
   const Completer completer = completerOf(toyConfig());
   CompleteSettings settings;
   settings.sampling_steps = 4;
-  const LatentGrid a = complete(completer, settings), b = complete(completer, settings);
+  const Place a = complete(completer, settings), b = complete(completer, settings);
   EXPECT_EQ(a.ijk, b.ijk);
   EXPECT_EQ(a.z, b.z);
   EXPECT_EQ(a.probability, b.probability);
   settings.seed = 2;
   EXPECT_NE(complete(completer, settings).z, a.z);
   settings.seed = 1, settings.temperature = 0;
-  const LatentGrid cold = complete(completer, settings);
+  const Place cold = complete(completer, settings);
   settings.seed = 2;
   EXPECT_EQ(complete(completer, settings).z, cold.z) << "without temperature nothing is random";
 }
@@ -977,7 +984,7 @@ TEST_F(CompleterFile, KeptTokensConditionTheNextLevel) {  // A11
   const Completer completer = completerOf(c);
   CompleteSettings settings;
   settings.tau = 0, settings.generated_context = true;
-  const LatentGrid whole = complete(completer, settings);
+  const Place whole = complete(completer, settings);
   // By hand: level 2 with level 1 in its context, and, to tell it apart, without.
   const SceneTokens t = sceneTokens(sample_.seen_nodes, sample_.seen_coarse);
   const std::map<Coord, float> open = gate();
@@ -1022,33 +1029,32 @@ TEST_F(CompleterFile, KeptTokensConditionTheNextLevel) {  // A11
 
 TEST_F(CompleterFile, GoesOnFromAnyLevelAsIfItHadNeverStopped) {
   const Completer completer = completerOf(toyConfig());
-  const SeenSpace space = spaceOf(sample_.seen_nodes);
   for (const bool generated_context : {false, true}) {
     CompleteSettings settings;
     settings.tau = .5f, settings.hole_tau = .1f, settings.sampling_steps = 3;
     settings.generated_context = generated_context;
-    std::vector<std::pair<LatentGrid, int32_t>> stops;
-    const LatentGrid whole = completer.complete(sample_.condition, space, settings, silent_,
-                                                [&](const LatentGrid& so_far, int32_t next_level) {
-                                                  stops.push_back({so_far, next_level});
-                                                });
+    std::vector<std::pair<Place, int32_t>> stops;
+    const Place whole = completer.complete(startOf(sample_), settings, silent_,
+                                           [&](const Place& so_far, int32_t next_level) {
+                                             stops.push_back({so_far, next_level});
+                                           });
     ASSERT_GE(stops.size(), 3u);
     for (const auto& [so_far, next_level] : stops) {
       SCOPED_TRACE(next_level);
       settings.first_level = next_level, settings.resumed = true;
-      const LatentGrid rest = completer.complete(so_far, space, settings, silent_);
+      const Place rest = completer.complete(so_far, settings, silent_);
       EXPECT_EQ(rest.ijk, whole.ijk);
       EXPECT_EQ(std::memcmp(rest.z.data(), whole.z.data(), whole.z.size() * sizeof(float)), 0);
       EXPECT_EQ(rest.probability, whole.probability);
       EXPECT_EQ(rest.bfs_level, whole.bfs_level);
-      EXPECT_EQ(rest.observed, whole.observed);
+      EXPECT_EQ(rest.generated, whole.generated);
     }
   }
 }
 
 TEST_F(CompleterFile, LatentsAreWhatFilesHold) {
   const Completer completer = completerOf(toyConfig());
-  const LatentGrid whole = complete(completer, CompleteSettings());
+  const Place whole = complete(completer, CompleteSettings());
   const Tensor z = torch::tensor(std::vector<float>(
       whole.z.begin() + std::ptrdiff_t(sample_.condition.z.size()), whole.z.end()));
   ASSERT_GT(z.numel(), 0);
@@ -1059,11 +1065,11 @@ TEST_F(CompleterFile, NothingIsGeneratedOutsideOfTheRegion) {
   const Completer completer = completerOf(toyConfig());
   CompleteSettings settings;
   settings.tau = 0;
-  const LatentGrid everywhere = complete(completer, settings);
+  const Place everywhere = complete(completer, settings);
   auto region = std::make_shared<TokenMask>();
   region->fill(CoordBBox(Coord(6, 0, 0), Coord(9, 9, 5)), true, true);
   settings.region = region;
-  const LatentGrid some = complete(completer, settings);
+  const Place some = complete(completer, settings);
   expectObservedRowsFirst(some);
   std::map<Coord, int32_t> expected, found;
   for (int64_t i = sample_.condition.size(); i < everywhere.size(); ++i)
@@ -1079,31 +1085,30 @@ TEST_F(CompleterFile, GeneratedTokensOfTheStartStay) {
   const Completer completer = completerOf(toyConfig());
   CompleteSettings settings;
   settings.tau = .4f;
-  const LatentGrid first = complete(completer, settings);
-  const LatentGrid start =
-      keepTokens(first, [&](size_t i) { return first.observed[i] || first.ijk[i].y() < 5; });
+  const Place first = complete(completer, settings);
+  const Place start =
+      keepRows(first, [&](size_t i) { return !first.generated[i] || first.ijk[i].y() < 5; });
   ASSERT_GT(start.size(), sample_.condition.size());
   settings.seed = 2, settings.sampling_steps = 2,
   settings.tau = .9f;  // also those that it would drop
-  const LatentGrid again =
-      completer.complete(start, spaceOf(sample_.seen_nodes), settings, silent_);
+  const Place again = completer.complete(start, settings, silent_);
   ASSERT_GE(again.size(), start.size());
   expectNoDuplicates(again);
   EXPECT_TRUE(std::equal(start.ijk.begin(), start.ijk.end(), again.ijk.begin()));
   EXPECT_EQ(std::memcmp(start.z.data(), again.z.data(), start.z.size() * sizeof(float)), 0);
-  LatentGrid mixed = start;
-  std::swap(mixed.observed.front(), mixed.observed.back());
-  EXPECT_THROW(completer.complete(mixed, spaceOf(sample_.seen_nodes), settings, silent_), Error);
+  Place mixed = start;
+  std::swap(mixed.generated.front(), mixed.generated.back());
+  EXPECT_THROW(completer.complete(mixed, settings, silent_), Error);
 }
 
 TEST_F(CompleterFile, WithoutGeneratedContextAHigherTauOnlyDrops) {
   const Completer completer = completerOf(toyConfig());
   CompleteSettings settings;
   settings.tau = .3f, settings.hole_tau = 1;
-  const LatentGrid low = complete(completer, settings);
+  const Place low = complete(completer, settings);
   settings.tau = .55f;
-  const LatentGrid high = complete(completer, settings);
-  const LatentGrid dropped = keepTokens(low, [&](size_t i) { return low.probability[i] > .55f; });
+  const Place high = complete(completer, settings);
+  const Place dropped = keepRows(low, [&](size_t i) { return low.probability[i] > .55f; });
   EXPECT_LT(high.size(), low.size());
   EXPECT_GT(high.size(), sample_.condition.size());
   EXPECT_EQ(high.ijk, dropped.ijk);
@@ -1113,28 +1118,29 @@ TEST_F(CompleterFile, WithoutGeneratedContextAHigherTauOnlyDrops) {
 TEST_F(CompleterFile, PlacesBeyondOneWindowAreVisitedOnceEverywhere) {
   // A floor of 30 m, seen at one end and in the middle; dense states of the rest are unknown.
   const Completer completer = completerOf(toyConfig());
-  LatentGrid seen;
+  Place seen;
   seen.dim = kDim;
   seen.frame.bounds = CoordBBox(Coord(0), Coord(303, 15, 7));
-  SeenSpace space;
+  const auto space = std::make_shared<SeenSpace>();
   for (int x0 : {0, 70})
     for (auto c = CoordBBox(Coord(x0, 0, 1), Coord(x0 + 3, 3, 1)).begin(); c; ++c) {
       seen.ijk.push_back(*c);
       for (int d = 0; d < kDim; ++d) seen.z.push_back(std::sin(float(d)));
-      for (int slot = 0; slot < 8; ++slot) space.filled.setValueOn(childCoord(*c, slot));
+      for (int slot = 0; slot < 8; ++slot) space->filled.setValueOn(childCoord(*c, slot));
     }
-  seen.observed.assign(seen.ijk.size(), 1), seen.probability.assign(seen.ijk.size(), 1.f);
+  seen.seen = space;
+  seen.generated.assign(seen.ijk.size(), 0), seen.probability.assign(seen.ijk.size(), 1.f);
   seen.bfs_level.assign(seen.ijk.size(), 0);
   CompleteSettings settings;
   settings.tau = 0, settings.coarse_tau = 0;
-  const LatentGrid whole = completer.complete(seen, space, settings, silent_);
+  const Place whole = completer.complete(seen, settings, silent_);
   expectNoDuplicates(whole);
   // Four windows of 38 nodes; the last one is too far from anything seen.
   EXPECT_EQ(whole.size(), 3 * 38 * 8 * 4);
   for (const Coord& c : whole.ijk) EXPECT_LT(c.x(), 3 * 38);
   for (const float z : whole.z) ASSERT_TRUE(std::isfinite(z));
   settings.refine_observed = true;  // each in its own window too
-  const LatentGrid refined = completer.complete(seen, space, settings, silent_);
+  const Place refined = completer.complete(seen, settings, silent_);
   for (const float z : refined.z) ASSERT_TRUE(std::isfinite(z));
   for (size_t i = 0; i < seen.ijk.size(); ++i) EXPECT_NE(refined.z[i * kDim], seen.z[i * kDim]);
 }
@@ -1143,8 +1149,7 @@ TEST_F(CompleterFile, OracleMakesExactlyTheGivenTokens) {  // the oracle of the 
   const Completer completer = completerOf(toyConfig());
   std::vector<Coord> occupied = sample_.target.ijk;  // with what was seen already
   occupied.push_back(occupied.back());               // and one twice
-  const LatentGrid whole = completer.completeAt(sample_.condition, spaceOf(sample_.seen_nodes),
-                                                occupied, CompleteSettings(), silent_);
+  const Place whole = completer.completeAt(startOf(sample_), occupied, CompleteSettings(), silent_);
   expectObservedRowsFirst(whole);
   expectNoDuplicates(whole);
   EXPECT_EQ(std::set<Coord>(whole.ijk.begin(), whole.ijk.end()),
@@ -1154,11 +1159,11 @@ TEST_F(CompleterFile, OracleMakesExactlyTheGivenTokens) {  // the oracle of the 
 TEST_F(CompleterFile, RefinementRewritesObservedLatentsAlone) {  // A8
   const Completer completer = completerOf(toyConfig());
   CompleteSettings settings;
-  const LatentGrid plain = complete(completer, settings);
+  const Place plain = complete(completer, settings);
   settings.refine_observed = true;
-  const LatentGrid refined = complete(completer, settings);
+  const Place refined = complete(completer, settings);
   EXPECT_EQ(refined.ijk, plain.ijk);
-  EXPECT_EQ(refined.observed, plain.observed);
+  EXPECT_EQ(refined.generated, plain.generated);
   const auto seen = std::ptrdiff_t(sample_.condition.z.size());
   EXPECT_TRUE(std::equal(plain.z.begin() + seen, plain.z.end(), refined.z.begin() + seen));
   for (size_t i = 0; i < size_t(sample_.condition.size()); ++i)
@@ -1169,15 +1174,15 @@ TEST_F(CompleterFile, RefinementRewritesObservedLatentsAlone) {  // A8
 
 TEST_F(CompleterFile, RefusesWhatItCannotComplete) {
   const Completer completer = completerOf(toyConfig());
-  const SeenSpace space = spaceOf(sample_.seen_nodes);
-  LatentGrid grid = sample_.condition;
+  Place grid = startOf(sample_);
   grid.level = 2;
-  EXPECT_THROW(completer.complete(grid, space, {}, silent_), Error);
-  grid = LatentGrid();
+  EXPECT_THROW(completer.complete(grid, {}, silent_), Error);
+  grid = Place();
+  grid.seen = spaceOf(sample_.seen_nodes);
   grid.dim = kDim;
-  EXPECT_THROW(completer.complete(grid, space, {}, silent_), Error);
-  grid = sample_.condition, grid.dim = 4;
-  EXPECT_THROW(completer.complete(grid, space, {}, silent_), Error);
+  EXPECT_THROW(completer.complete(grid, {}, silent_), Error);
+  grid = startOf(sample_), grid.dim = 4;
+  EXPECT_THROW(completer.complete(grid, {}, silent_), Error);
 }
 
 class StopAtOnce : public Progress {
@@ -1188,8 +1193,7 @@ class StopAtOnce : public Progress {
 TEST_F(CompleterFile, CanBeStopped) {
   const Completer completer = completerOf(toyConfig());
   StopAtOnce stop;
-  EXPECT_THROW(completer.complete(sample_.condition, spaceOf(sample_.seen_nodes), {}, stop),
-               Cancelled);
+  EXPECT_THROW(completer.complete(startOf(sample_), {}, stop), Cancelled);
 }
 
 TEST_F(CompleterFile, NothingUnseenLeavesTheGridAsItIs) {
@@ -1197,7 +1201,9 @@ TEST_F(CompleterFile, NothingUnseenLeavesTheGridAsItIs) {
   NodeStates all = sample_.seen_nodes;
   for (NodeState& s : all.states)
     if (s == NodeState::kUnobserved) s = NodeState::kEmpty;
-  const LatentGrid whole = completer.complete(sample_.condition, spaceOf(all), {}, silent_);
+  Place start = sample_.condition;
+  start.seen = spaceOf(all);
+  const Place whole = completer.complete(start, {}, silent_);
   EXPECT_EQ(whole.ijk, sample_.condition.ijk);
   EXPECT_EQ(whole.z, sample_.condition.z);
 }
@@ -1295,11 +1301,11 @@ TEST_F(CompleterFile, HolesAreClosedWithDroppedTokensAlone) {
   const Completer completer = completerOf(toyConfig());
   CompleteSettings settings;
   settings.tau = .5f, settings.hole_tau = 1;
-  const LatentGrid open = complete(completer, settings);
+  const Place open = complete(completer, settings);
   settings.tau = 0;
-  const LatentGrid everything = complete(completer, settings);
+  const Place everything = complete(completer, settings);
   settings.tau = .5f, settings.hole_tau = .01f;
-  const LatentGrid closed = complete(completer, settings);
+  const Place closed = complete(completer, settings);
   expectNoDuplicates(closed);
   ASSERT_GT(closed.size(), open.size());
   EXPECT_TRUE(std::equal(open.ijk.begin(), open.ijk.end(), closed.ijk.begin()));
@@ -1375,7 +1381,7 @@ TEST_F(SampleFile, RoundTripIsExact) {
     EXPECT_EQ(a->ijk, b->ijk);
     EXPECT_EQ(a->z, b->z);
     EXPECT_EQ(a->dim, b->dim);
-    EXPECT_EQ(a->observed, b->observed);
+    EXPECT_EQ(a->generated, b->generated);
     EXPECT_EQ(a->probability, b->probability);
     EXPECT_EQ(a->bfs_level, b->bfs_level);
     EXPECT_EQ(a->frame.bounds, b->frame.bounds);

@@ -29,10 +29,11 @@ VoxelFrame fittedFrame(const std::vector<View>& views, float voxel_m) {
 }
 
 Observation observed(const std::vector<View>& views, const VoxelFrame& frame, int patches_across) {
-  ObservationSettings settings;
+  ObserveSettings settings;
+  settings.frame = frame;
   settings.patches_across = patches_across;
   Progress silent;
-  return observe(views, frame, settings, silent);
+  return observe(views, settings, silent);
 }
 
 /// A usable pixel whose point lies in the bounds.

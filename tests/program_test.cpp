@@ -29,6 +29,7 @@
 #include "tests/simple_room.h"
 #include "tests/view_files.h"
 #include "vdb/error.h"
+#include "vdb/fit_volume.h"
 #include "vdb/latent_vdb.h"
 #include "vdb/scene_vdb.h"
 
@@ -584,12 +585,12 @@ TEST_F(Program, EncodeThenDecodeWritesWhatWasSeen) {
   const Ended encoded = run({"encode", views, "-o", latents, "--weights", VDBC_WEIGHTS, "--json"});
   ASSERT_EQ(encoded.code, kOk) << encoded.err;
   EXPECT_EQ(listing(output_), Args{"x.latent.vdb"});
-  const LatentFile file = readLatentVdb(latents);
+  const Place place = readLatentVdb(latents);
   const json said = json::parse(encoded.out);
-  EXPECT_EQ(said.at("tokens"), file.latents.size());
+  EXPECT_EQ(said.at("tokens"), place.size());
   EXPECT_EQ(said.at("output"), latents);
   EXPECT_GT(said.at("seconds").get<double>(), 0);
-  EXPECT_EQ(file.encoder_hash.size(), 16u);
+  EXPECT_EQ(place.encoder_hash.size(), 16u);
 
   const Ended decoded =
       run({"decode", latents, "-o", output_ + "/y.vdb", "--weights", VDBC_WEIGHTS, "--json"});
@@ -599,10 +600,10 @@ TEST_F(Program, EncodeThenDecodeWritesWhatWasSeen) {
   std::set<Coord> observed;
   for (size_t i = 0; i < voxels.ijk.size(); ++i)
     if (voxels.observed[i]) observed.insert(voxels.ijk[i]);
-  const std::vector<Coord> filled = activeCoords(file.seen.filled);
+  const std::vector<Coord> filled = activeCoords(place.seen->filled);
   EXPECT_EQ(observed, std::set<Coord>(filled.begin(), filled.end()));
   const json result = json::parse(decoded.out);
-  EXPECT_EQ(result.at("tokens"), file.latents.size());
+  EXPECT_EQ(result.at("tokens"), place.size());
   EXPECT_EQ(result.at("voxels"), voxels.ijk.size());
   EXPECT_EQ(result.at("gaussians"), readPly(output_ + "/y.ply").size());
   // The place looks as it did.
@@ -613,14 +614,15 @@ TEST_F(Program, EncodeThenDecodeWritesWhatWasSeen) {
 
 TEST_F(Program, DecodeRefusesOtherWeightsAndFiles) {
   NEEDS_WEIGHTS();
-  LatentFile file;
-  file.encoder_hash = "fedcba9876543210";
-  file.latents.dim = 32;
-  file.latents.frame.bounds = CoordBBox(Coord(0), Coord(7));
-  file.latents.ijk = {Coord(1, 2, 3)};
-  file.latents.z.assign(32, 0.f);
-  file.latents.observed = {1}, file.latents.probability = {1}, file.latents.bfs_level = {0};
-  writeLatentVdb(file, at("other.latent.vdb"));
+  Place other;
+  other.seen = std::make_shared<SeenSpace>();
+  other.encoder_hash = "fedcba9876543210";
+  other.dim = 32;
+  other.frame.bounds = CoordBBox(Coord(0), Coord(7));
+  other.ijk = {Coord(1, 2, 3)};
+  other.z.assign(32, 0.f);
+  other.generated = {0}, other.probability = {1}, other.bfs_level = {0};
+  writeLatentVdb(other, at("other.latent.vdb"));
   const auto decode = [&](const std::string& latents, const std::string& output) {
     return Args{"decode", latents, "-o", output, "--weights", VDBC_WEIGHTS};
   };
@@ -649,34 +651,32 @@ TEST_F(Program, LatentsOfACompletionAreCompletedAgain) {
   const Ended first = run(complete(writeRoom("views"), {"--margin", ".4"}));
   ASSERT_EQ(first.code, kOk) << first.err;
   const std::string latents = output_ + "/x.latent.vdb";
-  const LatentFile before = readLatentVdb(latents);
-  const int32_t last =
-      *std::max_element(before.latents.bfs_level.begin(), before.latents.bfs_level.end());
+  const Place before = readLatentVdb(latents);
+  const int32_t last = *std::max_element(before.bfs_level.begin(), before.bfs_level.end());
   ASSERT_GE(last, 3);
   auto again = [&](const Args& more) {
     Args args = {latents, "-o", at("y/y.vdb"), "--weights", VDBC_WEIGHTS, "--json"};
     args.insert(args.end(), more.begin(), more.end());
     const Ended ended = run(args);
     EXPECT_EQ(ended.code, kOk) << ended.err;
-    return readLatentVdb(at("y/y.latent.vdb")).latents;
+    return readLatentVdb(at("y/y.latent.vdb"));
   };
   // The same run from encoded latents: the same bytes.
-  EXPECT_EQ(again({}).z, before.latents.z);
+  EXPECT_EQ(again({}).z, before.z);
   EXPECT_EQ(listing(at("y")), (Args{"y.latent.vdb", "y.ply", "y.points.vdb", "y.vdb"}));
   for (const char* ending : {".ply", ".points.vdb", ".latent.vdb"})
     EXPECT_TRUE(readText(at("y/y") + ending) == readText(output_ + "/x" + ending)) << ending;
   // Levels below the given one stay, whatever tau is, the others are made anew.
-  const LatentGrid other =
+  const Place other =
       again({"--from-level", "2", "--sampling-steps", "2", "--seed", "9", "--tau", ".6"});
-  const LatentGrid kept =
-      keepTokens(before.latents, [&](size_t i) { return before.latents.bfs_level[i] < 2; });
+  const Place kept = keepRows(before, [&](size_t i) { return before.bfs_level[i] < 2; });
   ASSERT_GT(other.size(), kept.size());
   EXPECT_TRUE(std::equal(kept.ijk.begin(), kept.ijk.end(), other.ijk.begin()));
   EXPECT_TRUE(std::equal(kept.z.begin(), kept.z.end(), other.z.begin()));
-  EXPECT_NE(other.z, before.latents.z);
+  EXPECT_NE(other.z, before.z);
   // Nothing outside of a region, nothing new where it is locked.
   SceneVoxels half;
-  half.frame = before.latents.frame;
+  half.frame = before.frame;
   const CoordBBox box = half.frame.bounds;
   const int middle = (box.min().x() + box.max().x() + 1) / 2;
   for (auto v = box.begin(); v; ++v) {
@@ -685,23 +685,21 @@ TEST_F(Program, LatentsOfACompletionAreCompletedAgain) {
     half.observed.push_back(1), half.probability.push_back(1), half.bfs_level.push_back(0);
   }
   writeSceneVdb(half, at("half.vdb"));
-  auto generatedSides = [&](const LatentGrid& g) {
+  auto generatedSides = [&](const Place& g) {
     std::set<bool> sides;
     for (size_t i = 0; i < g.ijk.size(); ++i)
-      if (!g.observed[i]) sides.insert(g.ijk[i].x() * 2 >= middle);
+      if (g.generated[i]) sides.insert(g.ijk[i].x() * 2 >= middle);
     return sides;
   };
-  ASSERT_EQ(generatedSides(before.latents).size(), 2u);
+  ASSERT_EQ(generatedSides(before).size(), 2u);
   EXPECT_EQ(generatedSides(again({"--region", at("half.vdb")})), std::set<bool>{false});
-  const LatentGrid locked =
-      again({"--lock", at("half.vdb"), "--sampling-steps", "2", "--seed", "9"});
+  const Place locked = again({"--lock", at("half.vdb"), "--sampling-steps", "2", "--seed", "9"});
   std::map<Coord, size_t> row;
   for (size_t i = 0; i < locked.ijk.size(); ++i) row[locked.ijk[i]] = i;
-  for (size_t i = 0; i < before.latents.ijk.size(); ++i) {
-    if (before.latents.ijk[i].x() * 2 >= middle) continue;
-    const size_t same = row.at(before.latents.ijk[i]), dim = size_t(locked.dim);
-    EXPECT_TRUE(
-        std::equal(&locked.z[same * dim], &locked.z[same * dim] + dim, &before.latents.z[i * dim]));
+  for (size_t i = 0; i < before.ijk.size(); ++i) {
+    if (before.ijk[i].x() * 2 >= middle) continue;
+    const size_t same = row.at(before.ijk[i]), dim = size_t(locked.dim);
+    EXPECT_TRUE(std::equal(&locked.z[same * dim], &locked.z[same * dim] + dim, &before.z[i * dim]));
   }
   for (const Args& more : {Args{"--frames", "0"}, Args{"--margin", "1"}, Args{"--scale", "2"},
                            Args{"--up", "0", "0", "1"}}) {
@@ -802,7 +800,7 @@ TEST_F(Program, AnInterruptedCompletionIsResumedToTheSameBytes) {
   expectFailure(complete(views, {"--resume"}), kFailed, checkpoint);
   const Ended whole = run(complete(views, options));
   ASSERT_EQ(whole.code, kOk) << whole.err;
-  const LatentGrid latents = readLatentVdb(output_ + "/x.latent.vdb").latents;
+  const Place place = readLatentVdb(output_ + "/x.latent.vdb");
   std::map<std::string, std::string> bytes;
   for (const std::string& name : kSiblings) {
     bytes[name] = readText(output_ + "/" + name);
@@ -811,7 +809,7 @@ TEST_F(Program, AnInterruptedCompletionIsResumedToTheSameBytes) {
   const Ended cut = run(complete(views, options), "complete", checkpoint);
   ASSERT_EQ(cut.code, kInterrupted) << "it was faster than the signal";
   EXPECT_EQ(listing(output_), Args{"x.checkpoint.latent.vdb"});
-  EXPECT_LT(readLatentVdb(checkpoint).latents.size(), latents.size());
+  EXPECT_LT(readLatentVdb(checkpoint).size(), place.size());
   expectFailure({"decode", checkpoint, "-o", at("y/y.vdb"), "--weights", VDBC_WEIGHTS}, kFailed,
                 "cut short");
   options.push_back("--resume");

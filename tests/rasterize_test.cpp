@@ -213,7 +213,7 @@ void addOnAxis(Gaussians* g, double z, double sigma, double opacity,
   one.log_scale[0].setConstant(float(std::log(sigma)));
   one.opacity_logit[0] = float(std::log(opacity / (1 - opacity)));
   for (int c = 0; c < 3; ++c) one.sh[size_t(c)] = (colour[c] - 0.5f) / kSh0;
-  append(g, one);
+  appendRows(g, one);
 }
 
 Camera centredCamera() {
@@ -744,7 +744,7 @@ TEST(Rasterize, DegenerateGaussiansContributeNothing) {
     g.log_scale[0].setConstant(-2.f);
     g.opacity_logit[0] = 1.f;
     spoils[k](g);
-    append(&g, clean);
+    appendRows(&g, clean);
     EXPECT_TRUE(sameBytes(rasterize(g, camera, settings).colour.data, truth.colour.data))
         << "case " << k;
     const auto [out, d] = runEverything(g, camera);
@@ -768,7 +768,7 @@ TEST(Rasterize, ExtremeGaussiansStayFinite) {
           more.rotation[i] = {1e-15f, 2e-15f, -1e-15f, 3e-15f};
           more.opacity_logit[i] = logit;
         }
-        append(&g, more);
+        appendRows(&g, more);
         const Everything all = runEverything(g, camera);  // antialiased
         EXPECT_TRUE(allFinite(all.out) && allFinite(all.d))
             << log_scale << " " << logit << " " << z;
@@ -798,7 +798,7 @@ TEST(Rasterize, GaussiansWithBrokenChannelsContributeNothing) {
   const Camera camera = tiltedCamera(40, 40);
   const Gaussians clean = randomScene(50, 0, camera, 75);
   Gaussians g = clean;
-  append(&g, randomScene(2, 0, camera, 76));
+  appendRows(&g, randomScene(2, 0, camera, 76));
   std::vector<float> values = randomImage(52, 2, 1, 77).data;
   values[101] = std::numeric_limits<float>::quiet_NaN();
   values[102] = std::numeric_limits<float>::infinity();
@@ -848,15 +848,15 @@ TEST(Gaussians, AppendConcatenatesAndChecks) {
   Gaussians a = randomScene(3, 1, tiltedCamera(8, 8), 81);
   const Gaussians b = randomScene(2, 1, tiltedCamera(8, 8), 82);
   const Gaussians a0 = a;
-  append(&a, b);
+  appendRows(&a, b);
   ASSERT_EQ(a.size(), 5);
   EXPECT_EQ(a.mean[1], a0.mean[1]);
   EXPECT_EQ(a.rotation[3], b.rotation[0]);
   EXPECT_EQ(a.sh[size_t(4 * 12 + 7)], b.sh[12 + 7]);
-  append(&a, a);
+  appendRows(&a, a);
   EXPECT_EQ(a.size(), 10);
   EXPECT_EQ(a.log_scale[9], b.log_scale[1]);
-  EXPECT_THROW(append(&a, randomScene(1, 0, tiltedCamera(8, 8), 83)), Error);
+  EXPECT_THROW(appendRows(&a, randomScene(1, 0, tiltedCamera(8, 8), 83)), Error);
   a.opacity_logit.pop_back();
   EXPECT_THROW(requireConsistent(a), Error);
 }

@@ -16,30 +16,27 @@ namespace {
 
 constexpr uint64_t kRoom = 41;
 
-struct Place {
+struct ViewedPlace {
   std::vector<View> views;
   Observation observation;
   std::vector<std::vector<uint8_t>> observed;
 };
 
-Place placeOf(std::vector<View> views) {
-  std::vector<DepthView> depth;
-  for (const View& v : views) depth.push_back(v.depthView());
+ViewedPlace placeOf(std::vector<View> views) {
   Progress silent;
-  Observation o = observe(views, fitVolume(depth, VolumeSettings(), CarveSettings()),
-                          ObservationSettings(), silent);
-  Place place{std::move(views), std::move(o), {}};
+  Observation o = observe(views, ObserveSettings(), silent);
+  ViewedPlace place{std::move(views), std::move(o), {}};
   for (const View& v : place.views)
     place.observed.push_back(observedPixels(v, place.observation, 1, CarveSettings()));
   return place;
 }
 
-const Place& simplePlace() {
-  static const Place place = placeOf(simpleRoomViews(4, 96, 72, kRoom));
+const ViewedPlace& simplePlace() {
+  static const ViewedPlace place = placeOf(simpleRoomViews(4, 96, 72, kRoom));
   return place;
 }
 
-double meanPsnr(const Gaussians& g, const Place& place) {
+double meanPsnr(const Gaussians& g, const ViewedPlace& place) {
   double sum = 0;
   for (size_t i = 0; i < place.views.size(); ++i)
     sum += pictureError(place.views[i].colour, rasterize(g, place.views[i].camera, {}).colour,
@@ -53,7 +50,7 @@ TEST(Reconstruct, VoxelMeanOfOneColourHasThatColour) {
   const float colour[3] = {.2f, .5f, .7f};
   for (View& v : views)
     for (size_t i = 0; i < v.colour.data.size(); ++i) v.colour.data[i] = colour[i % 3];
-  const Place place = placeOf(std::move(views));
+  const ViewedPlace place = placeOf(std::move(views));
   const Gaussians g = voxelMean(place.observation, 8);
   ASSERT_EQ(g.size(), 8 * place.observation.tokens.size(0));
   for (size_t i = 0; i < g.sh.size(); ++i) ASSERT_NEAR(.5f + kSh0 * g.sh[i], colour[i % 3], 1e-5);
@@ -74,8 +71,8 @@ TEST(Reconstruct, VoxelMeanLiesOnTheSubLattice) {
 }
 
 TEST(Reconstruct, PixelAlignedReproducesTheInput) {
-  const Place& place = simplePlace();
-  const Place one = placeOf({place.views[0]});
+  const ViewedPlace& place = simplePlace();
+  const ViewedPlace one = placeOf({place.views[0]});
   EXPECT_GT(meanPsnr(pixelAligned(one.views, one.observed), one), 30);
   const Gaussians all = pixelAligned(place.views, place.observed);
   int64_t pixels = 0;
@@ -85,7 +82,7 @@ TEST(Reconstruct, PixelAlignedReproducesTheInput) {
 }
 
 TEST(Reconstruct, OptimisingBeatsItsStart) {
-  const Place& place = simplePlace();
+  const ViewedPlace& place = simplePlace();
   const Gaussians start = voxelMean(place.observation, 8);
   OptimiseSettings settings;
   settings.seconds = 1e9, settings.max_steps = 40;
@@ -100,7 +97,7 @@ TEST(Reconstruct, AnInterruptedOptimisationStops) {
   struct Impatient : Progress {
     bool wasInterrupted(int) override { return true; }
   } impatient;
-  const Place& place = simplePlace();
+  const ViewedPlace& place = simplePlace();
   EXPECT_THROW(
       optimised(voxelMean(place.observation, 1), place.views, place.observed, {}, impatient),
       Cancelled);
@@ -179,14 +176,14 @@ TEST(Evaluate, OutsideIsWhatLiesBehindTheShell) {
 }
 
 TEST(Evaluate, ReliabilityCountsGeneratedNodes) {
-  LatentGrid latents;
-  const auto add = [&](int x, float probability, bool observed) {
-    latents.ijk.emplace_back(x, 0, 0);
-    latents.probability.push_back(probability), latents.observed.push_back(observed);
+  Place place;
+  const auto add = [&](int x, float probability, bool generated) {
+    place.ijk.emplace_back(x, 0, 0);
+    place.probability.push_back(probability), place.generated.push_back(generated);
   };
-  add(0, 1, true), add(1, .25f, false), add(2, .25f, false), add(3, .75f, false), add(4, 1, false),
-      add(5, 0, false);
-  const Reliability r = reliabilityOf(latents, {{0, 0, 0}, {1, 0, 0}, {4, 0, 0}});
+  add(0, 1, false), add(1, .25f, true), add(2, .25f, true), add(3, .75f, true), add(4, 1, true),
+      add(5, 0, true);
+  const Reliability r = reliabilityOf(place, {{0, 0, 0}, {1, 0, 0}, {4, 0, 0}});
   const std::array<int, 10> counts = {1, 0, 2, 0, 0, 0, 0, 1, 0, 1},
                             hits = {0, 0, 1, 0, 0, 0, 0, 0, 0, 1};
   for (size_t i = 0; i < r.size(); ++i) {
