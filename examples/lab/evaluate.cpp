@@ -10,6 +10,7 @@
 #include "encoder/views/read_views.h"
 #include "examples/lab/scenes.h"
 #include "examples/lab/scores.h"
+#include "examples/lab/feature_distances.h"
 #include "examples/rooms/rooms.h"
 #include "splat/image_files.h"
 #include "splat/metrics.h"
