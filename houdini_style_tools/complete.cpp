@@ -93,9 +93,7 @@ std::vector<Camera> novelCameras(const std::vector<View>& views, const Eigen::Ve
     c.width = width, c.height = height;
     c.fx = c.fy = width / (2 * std::tan(.5 * 80 * M_PI / 180));  // 80 degrees across
     c.cx = width / 2., c.cy = height / 2.;
-    const Eigen::Vector3d z = Eigen::AngleAxisd(i * M_PI / 2, up) * forward,
-                          x = z.cross(up).normalized();
-    c.world_from_camera.linear() << x, z.cross(x), z;
+    c.world_from_camera.linear() = lookAlong(Eigen::AngleAxisd(i * M_PI / 2, up) * forward, up);
     c.world_from_camera.translation() = place;
     cameras.push_back(c);
   }
@@ -109,22 +107,21 @@ Image contactSheet(const std::vector<View>& views, const Gaussians& observed,
   const int columns = 4, shown = std::min(columns, int(views.size()));
   const int height =
       int(std::lround(double(kTileWidth) * views[0].camera.height / views[0].camera.width));
-  Image sheet(columns * kTileWidth, 3 * height, 3, .15f);
+  std::vector<Image> tiles;
   for (int i = 0; i < shown; ++i) {
     const Camera& c = views[size_t(i)].camera;
     const double shrink = std::min(double(kTileWidth) / c.width, double(height) / c.height);
-    pasteImage(resizeImage(views[size_t(i)].colour, std::max(1, int(c.width * shrink)),
-                           std::max(1, int(c.height * shrink))),
-               i * kTileWidth, 0, &sheet);
+    tiles.push_back(resizeImage(views[size_t(i)].colour, std::max(1, int(c.width * shrink)),
+                                std::max(1, int(c.height * shrink))));
   }
+  tiles.resize(size_t(columns));
   const std::vector<Camera> cameras = novelCameras(views, up, kTileWidth, height);
   RasterSettings settings;
   settings.antialias = completed.antialias;
-  for (int row = 1; row < 3; ++row)
-    for (int i = 0; i < columns; ++i)
-      pasteImage(rasterize(row == 1 ? observed : completed, cameras[size_t(i)], settings).colour,
-                 i * kTileWidth, row * height, &sheet);
-  return sheet;
+  for (const Gaussians* gaussians : {&observed, &completed})
+    for (const Camera& camera : cameras)
+      tiles.push_back(rasterize(*gaussians, camera, settings).colour);
+  return tileImages(tiles, columns);
 }
 
 namespace {

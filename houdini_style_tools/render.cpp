@@ -26,16 +26,6 @@ constexpr double kTrimmed =
 
 double radians(double degrees) { return degrees * M_PI / 180; }
 
-/// The camera from `place` to `target`, level with `up`.
-Eigen::Isometry3d lookAt(const Eigen::Vector3d& place, const Eigen::Vector3d& target,
-                         const Eigen::Vector3d& up) {
-  const Eigen::Vector3d z = (target - place).normalized(), x = z.cross(up).normalized();
-  Eigen::Isometry3d world_from_camera;
-  world_from_camera.linear() << x, z.cross(x), z;
-  world_from_camera.translation() = place;
-  return world_from_camera;
-}
-
 Eigen::AlignedBox3d bulk(const Gaussians& g) {
   Eigen::AlignedBox3d box;
   box.min().setZero(), box.max().setOnes();

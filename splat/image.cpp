@@ -159,15 +159,24 @@ Image resizeImage(const Image& image, int width, int height) {
   return result;
 }
 
-void pasteImage(const Image& from, int x, int y, Image* to) {
-  requireImage("pasteImage", from);
-  require(x >= 0 && y >= 0 && x + from.width <= to->width && y + from.height <= to->height &&
-              from.channels == to->channels,
-          "pasteImage: ", from.width, " x ", from.height, " x ", from.channels, " at ", x, ", ", y,
-          " does not fit ", to->width, " x ", to->height, " x ", to->channels);
-  const size_t row = size_t(from.width) * size_t(from.channels);
-  for (int i = 0; i < from.height; ++i)
-    std::copy_n(&from.data[size_t(i) * row], row, &to->at(x, y + i, 0));
+Image tileImages(const std::vector<Image>& pictures, int columns) {
+  const int count = int(pictures.size());
+  columns = std::min(columns, count);
+  int width = 0, height = 0;
+  for (const Image& p : pictures) {
+    require(p.width == 0 || p.channels == 3, "tileImages: expected 3 channels, found ", p.channels);
+    width = std::max(width, p.width), height = std::max(height, p.height);
+  }
+  require(columns > 0 && width > 0, "tileImages: expected pictures, found none");
+  Image sheet(columns * width, (count + columns - 1) / columns * height, 3, .15f);
+  for (int i = 0; i < count; ++i) {
+    const Image& p = pictures[size_t(i)];
+    const size_t row = 3 * size_t(p.width);
+    for (int y = 0; y < p.height; ++y)
+      std::copy_n(&p.data[size_t(y) * row], row,
+                  &sheet.at(i % columns * width, i / columns * height + y, 0));
+  }
+  return sheet;
 }
 
 double psnr(const Image& a, const Image& b) {

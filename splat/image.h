@@ -32,8 +32,9 @@ float linearFromSrgb(float srgb);
 /// Area-averaging when shrinking, bilinear when growing.
 Image resizeImage(const Image& image, int width, int height);
 
-/// Writes `from` over the pixels of `to` from (x, y) on; it must fit and have as many channels.
-void pasteImage(const Image& from, int x, int y, Image* to);
+/// Pictures of 3 channels in rows of `columns`, or of all where there are fewer, each at the upper
+/// left of a cell in the size of the largest; an empty one leaves its cell dark.
+Image tileImages(const std::vector<Image>& pictures, int columns);
 
 /// 10 log10(1 / mean squared error) over all values; infinity for equal images. Values are 0-1.
 double psnr(const Image& a, const Image& b);

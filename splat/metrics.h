@@ -1,7 +1,6 @@
 #pragma once
-// How far images or their depth are from the true ones: FLIP, errors over some pixels, depth error,
-// distances between sets of features (PSNR and SSIM of whole images: image.h).
-#include <Eigen/Core>
+// How far images or their depth are from the true ones: FLIP, errors over some pixels, depth error
+// (PSNR and SSIM of whole images: image.h).
 #include <cstdint>
 #include <vector>
 
@@ -42,13 +41,5 @@ struct DepthError {
 };
 /// Planar depths of the same pixels, metres; 0 where there is none.
 DepthError depthError(const std::vector<float>& depth, const std::vector<float>& truth);
-
-/// Between the features of two sets of images, one row an image, at least two rows each: of
-/// Gaussians fitted to them (FID if the network is its Inception, Heusel et al. 2017), |mean_a -
-/// mean_b|^2 + tr(cov_a + cov_b - 2 (cov_a cov_b)^(1/2)). Biased upwards for few images.
-double frechetDistance(const Eigen::MatrixXd& a, const Eigen::MatrixXd& b);
-/// The same by the unbiased squared maximum mean discrepancy with the kernel (x y / columns + 1)^3
-/// (KID, Binkowski et al. 2018). May be below 0 for sets alike.
-double kernelDistance(const Eigen::MatrixXd& a, const Eigen::MatrixXd& b);
 
 }  // namespace vdbc

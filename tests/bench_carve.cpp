@@ -25,8 +25,7 @@ std::vector<View> syntheticViews() {
     c.width = 640, c.height = 480, c.fx = c.fy = 585, c.cx = 320, c.cy = 240;
     const double yaw = double(n) * M_PI / 4;
     const Eigen::Vector3d z = Eigen::Vector3d(std::cos(yaw), std::sin(yaw), -0.2).normalized();
-    const Eigen::Vector3d x = z.cross(Eigen::Vector3d::UnitZ()).normalized();
-    c.world_from_camera.linear() << x, z.cross(x), z;
+    c.world_from_camera.linear() = lookAlong(z, Eigen::Vector3d::UnitZ());
     c.world_from_camera.translation() =
         Eigen::Vector3d(2.5, 2, 1.5) - 0.8 * Eigen::Vector3d(std::cos(yaw), std::sin(yaw), 0);
     views[n].depth.resize(size_t(c.width) * c.height);

@@ -89,11 +89,8 @@ Camera roomCamera(int width, int height) {
   camera.width = width, camera.height = height;
   camera.fx = camera.fy = 0.5 * width / std::tan(35 * M_PI / 180);
   camera.cx = 0.5 * width, camera.cy = 0.5 * height;
-  const Eigen::Vector3d eye(0.3, 0.18, 1.35),
-      forward = Eigen::Vector3d(0.67, 0.74, 0.07).normalized();
-  const Eigen::Vector3d right = forward.cross(Eigen::Vector3d::UnitZ()).normalized();
-  camera.world_from_camera.linear() << right, forward.cross(right), forward;
-  camera.world_from_camera.translation() = eye;
+  const Eigen::Vector3d eye(0.3, 0.18, 1.35), forward(0.67, 0.74, 0.07);
+  camera.world_from_camera = lookAt(eye, eye + forward, Eigen::Vector3d::UnitZ());
   return camera;
 }
 

@@ -100,11 +100,7 @@ void expectSameAsTraversal(const VoxelFrame& frame, const std::vector<OwnedView>
 const Eigen::AlignedBox3d kRoom(Vector3d(-2.03, -1.51, -1.27), Vector3d(2.41, 1.83, 1.19));
 
 Eigen::Matrix3d lookAlong(const Vector3d& forward) {
-  const Vector3d z = forward.normalized();
-  const Vector3d x = z.cross(Vector3d(0.1, 0.2, 1)).normalized();
-  Eigen::Matrix3d r;
-  r << x, z.cross(x), z;
-  return r;
+  return vdbc::lookAlong(forward.normalized(), Vector3d(0.1, 0.2, 1));
 }
 
 std::vector<OwnedView> roomViews(int width, int height, double f) {

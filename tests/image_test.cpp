@@ -323,6 +323,22 @@ TEST(Resize, GrowingIsExactOnLinearRampsInside) {
     }
 }
 
+TEST(Tiles, StandInRowsInTheirCells) {
+  const Image sheet = tileImages({Image(2, 3, 3, .5f), Image(), Image(4, 1, 3, .75f)}, 2);
+  ASSERT_EQ(sheet.width, 8);
+  ASSERT_EQ(sheet.height, 6);
+  for (int y = 0; y < 6; ++y)
+    for (int x = 0; x < 8; ++x)
+      for (int c = 0; c < 3; ++c) {
+        const bool first = x < 2 && y < 3, third = x < 4 && y == 3;
+        EXPECT_EQ(sheet.at(x, y, c), first ? .5f : third ? .75f : .15f) << x << ", " << y;
+      }
+  EXPECT_EQ(tileImages({Image(5, 4, 3)}, 8).width, 5);
+  EXPECT_THROW(tileImages({}, 8), Error);
+  EXPECT_THROW(tileImages({Image()}, 8), Error);
+  EXPECT_THROW(tileImages({Image(5, 4, 1)}, 8), Error);
+}
+
 TEST(Psnr, ClosedForms) {
   Image a(13, 7, 3, 0.25f), b(13, 7, 3, 0.75f);
   EXPECT_NEAR(psnr(a, b), 20 * std::log10(2.0), 1e-9);  // mse 1/4

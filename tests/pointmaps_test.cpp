@@ -100,9 +100,7 @@ Scene ballInBox(int count = 3) {
   for (int s = 0; s < count; ++s) {
     Camera c{kWidth, kHeight, 20.5 + s, 21.5, 12.25, 7.5, Eigen::Isometry3d::Identity()};
     const Vector3d eye(2.2 * std::cos(.7 * s), 2.2 * std::sin(.7 * s), .4 * s - .3);
-    const Vector3d z = -eye.normalized(), x = z.cross(Vector3d::UnitZ()).normalized();
-    c.world_from_camera.linear() << x, z.cross(x), z;
-    c.world_from_camera.translation() = eye;
+    c.world_from_camera = lookAt(eye, Vector3d::Zero(), Vector3d::UnitZ());
     scene.cameras.push_back(c);
     scene.depth.emplace_back();
     scene.colour.emplace_back(kWidth, kHeight, 3);

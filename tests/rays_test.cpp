@@ -253,14 +253,9 @@ TriangleMesh boxRoom() {
   return mesh;
 }
 
-Camera lookAt(const Vector3d& eye, const Vector3d& target, int width, int height, double focal) {
-  Camera c;
-  c.width = width, c.height = height, c.fx = c.fy = focal, c.cx = width / 2., c.cy = height / 2.;
-  const Vector3d forward = (target - eye).normalized();
-  const Vector3d right = forward.cross(Vector3d::UnitZ()).normalized();
-  c.world_from_camera.linear() << right, forward.cross(right), forward;
-  c.world_from_camera.translation() = eye;
-  return c;
+Camera cameraAt(const Vector3d& eye, const Vector3d& target, int width, int height, double focal) {
+  return {
+      width, height, focal, focal, width / 2., height / 2., lookAt(eye, target, Vector3d::UnitZ())};
 }
 
 /// Depth by Embree through the pixel centres.
@@ -283,9 +278,9 @@ View traced(const RayTarget& target, const Camera& c) {
 }
 
 std::vector<View> boxViews(const RayTarget& target) {
-  return {traced(target, lookAt({.5, .5, 1.4}, {3, 2, .8}, 240, 180, 130)),
-          traced(target, lookAt({3.5, .4, 1.6}, {1, 2.2, .7}, 240, 180, 130)),
-          traced(target, lookAt({1.2, 2.6, 1.2}, {3.2, .3, 1.1}, 240, 180, 130))};
+  return {traced(target, cameraAt({.5, .5, 1.4}, {3, 2, .8}, 240, 180, 130)),
+          traced(target, cameraAt({3.5, .4, 1.6}, {1, 2.2, .7}, 240, 180, 130)),
+          traced(target, cameraAt({1.2, 2.6, 1.2}, {3.2, .3, 1.1}, 240, 180, 130))};
 }
 
 TEST(DepthAgreement, CountsErrorsMissesAndInvalidPixels) {

@@ -80,11 +80,8 @@ Camera cameraAt(const Vector3d& eye, const Vector3d& target, int width, int heig
   Camera c;
   c.width = width, c.height = height;
   c.fx = c.fy = focal * height, c.cx = width / 2., c.cy = height / 2.;
-  const Vector3d forward = (target - eye).normalized();
-  const Vector3d up = std::abs(forward.z()) > .99 ? Vector3d::UnitY() : Vector3d::UnitZ();
-  const Vector3d right = forward.cross(up).normalized();
-  c.world_from_camera.linear() << right, forward.cross(right), forward;
-  c.world_from_camera.translation() = eye;
+  const bool is_level = std::abs((target - eye).normalized().z()) <= .99;
+  c.world_from_camera = lookAt(eye, target, is_level ? Vector3d::UnitZ() : Vector3d::UnitY());
   return c;
 }
 

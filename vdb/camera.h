@@ -24,6 +24,26 @@ struct Camera {
   }
 };
 
+/// Rotation of a camera that looks along the unit vector `forward`, level with `up`; where the two
+/// are parallel, with any one side up.
+inline Eigen::Matrix3d lookAlong(const Eigen::Vector3d& forward, const Eigen::Vector3d& up) {
+  const Eigen::Vector3d side = forward.cross(up);
+  const Eigen::Vector3d right =
+      side.norm() > 1e-3 * up.norm() ? side.normalized() : forward.unitOrthogonal();
+  Eigen::Matrix3d rotation;
+  rotation << right, forward.cross(right), forward;
+  return rotation;
+}
+
+/// Pose of a camera at `eye` that looks at `target`.
+inline Eigen::Isometry3d lookAt(const Eigen::Vector3d& eye, const Eigen::Vector3d& target,
+                                const Eigen::Vector3d& up) {
+  Eigen::Isometry3d world_from_camera = Eigen::Isometry3d::Identity();
+  world_from_camera.linear() = lookAlong((target - eye).normalized(), up);
+  world_from_camera.translation() = eye;
+  return world_from_camera;
+}
+
 /// The same camera for an image resized to width x height.
 inline Camera resized(const Camera& camera, int width, int height) {
   Camera c = camera;

@@ -425,9 +425,7 @@ Camera cameraAt(const Vector3d& place, const Vector3d& look, const Vector3d& up)
   camera.width = camera.height = kViewSide;
   camera.fx = camera.fy = 0.5 * kViewSide / std::tan(0.5 * kFieldOfView);
   camera.cx = camera.cy = 0.5 * kViewSide;
-  Vector3d x = look.cross(up);
-  x = x.norm() > 1e-3 ? x.normalized() : look.unitOrthogonal();
-  camera.world_from_camera.linear() << x, look.cross(x), look;
+  camera.world_from_camera.linear() = lookAlong(look, up);
   camera.world_from_camera.translation() = place;
   return camera;
 }

@@ -8,6 +8,7 @@
 #include <random>
 
 #include "encoder/views/read_views.h"
+#include "examples/lab/feature_distances.h"
 #include "examples/lab/scenes.h"
 #include "examples/lab/scores.h"
 #include "examples/rooms/rooms.h"
@@ -339,13 +340,12 @@ Gaussians pixelAligned(const std::vector<View>& views,
 }
 
 void writeColumns(const std::vector<std::vector<Image>>& columns, const std::string& path) {
-  const int width = columns[0][0].width, height = columns[0][0].height;
-  Image sheet(width * int(columns.size()), height * int(columns[0].size()), 3);
-  for (size_t c = 0; c < columns.size(); ++c)
-    for (size_t r = 0; r < columns[c].size(); ++r)
-      pasteImage(resizeImage(columns[c][r], width, height), int(c) * width, int(r) * height,
-                 &sheet);
-  writePng(sheet, path);
+  const Image& first = columns[0][0];
+  std::vector<Image> tiles;
+  for (size_t row = 0; row < columns[0].size(); ++row)
+    for (const std::vector<Image>& column : columns)
+      tiles.push_back(resizeImage(column[row], first.width, first.height));
+  writePng(tileImages(tiles, int(columns.size())), path);
 }
 
 namespace {

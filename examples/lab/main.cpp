@@ -8,9 +8,11 @@
 #include "encoder/encoder_train.h"
 #include "examples/lab/reconstruct.h"
 #include "examples/lab/scenes.h"
+#include "examples/lab/tables.h"
 #include "houdini_style_tools/console.h"
 #include "houdini_style_tools/options.h"
 #include "mar/completer_train.h"
+#include "vdb/file_io.h"
 #include "vdb/threads.h"
 
 namespace vdbc {
@@ -332,6 +334,39 @@ void addTrain(CLI::App* verb, Train* t, int64_t steps, int64_t rooms, double rat
   });
 }
 
+struct Tables {
+  std::vector<std::string> files, configurations;
+  std::vector<std::string> scores = {
+      "psnr", "ssim", "flip",    "precision", "recall", "shell_recall", "furniture_recall",
+      "f1",   "iou",  "outside", "leak",      "ece",    "seconds"};
+  std::string method = "completed", csv, reliability;
+};
+
+void writeText(const std::string& path, const std::string& text) {
+  if (!path.empty()) writeFile("tables", path, text.data(), text.size());
+}
+
+void cookTables(const Tables& o) {
+  std::vector<ResultLine> lines;
+  for (const std::string& file : o.files)
+    for (const ResultLine& line : readResults(file)) lines.push_back(line);
+  writeText(o.csv, methodCsv(lines));
+  writeText(o.reliability, reliabilityCsv(lines));
+  std::printf("%s", methodTables(lines, o.scores).c_str());
+}
+
+void cookCompare(const Tables& o) {
+  std::vector<NamedResults> all;
+  for (const std::string& configuration : o.configurations) {
+    const size_t equals = configuration.find('=');
+    if (equals == std::string::npos)
+      throw UsageError(joinText("compare: ", configuration, ": expected NAME=FILE"));
+    all.push_back({configuration.substr(0, equals), readResults(configuration.substr(equals + 1))});
+  }
+  writeText(o.csv, comparisonCsv(all, o.method));
+  std::printf("%s", comparisonTable(all, o.method, o.scores).c_str());
+}
+
 int run(int argc, char** argv) {
   CLI::App app{"Trains the networks of vdb_complete, and measures them.", "vdb_lab"};
   Common common;
@@ -351,6 +386,17 @@ int run(int argc, char** argv) {
   train_mar->add_option("--encoder", train.encoder, "encoder weights")->required();
   train_mar->add_option("--from", train.from, "completer weights to start from [random]")
       ->excludes(train_mar->get_option("--resume"));
+  Tables tables;
+  CLI::App* verb_tables = app.add_subcommand("tables", "");
+  verb_tables->add_option("FILES", tables.files)->required();
+  verb_tables->add_option("--reliability", tables.reliability);
+  CLI::App* verb_compare = app.add_subcommand("compare", "");
+  verb_compare->add_option("FILES", tables.configurations)->required();
+  verb_compare->add_option("--method", tables.method);
+  for (CLI::App* verb : {verb_tables, verb_compare}) {
+    verb->add_option("--scores", tables.scores);
+    verb->add_option("--csv", tables.csv);
+  }
   for (CLI::App* verb : {verb_eval, train_encoder, train_mar}) addCommon(verb, &common);
 
   try {
@@ -361,7 +407,11 @@ int run(int argc, char** argv) {
   }
   Console console(common.json);
   withThreads(common.threads, [&] {
-    if (verb_eval->parsed())
+    if (verb_tables->parsed())
+      cookTables(tables);
+    else if (verb_compare->parsed())
+      cookCompare(tables);
+    else if (verb_eval->parsed())
       (evaluate.reconstruct ? cookReconstruct : cookEvaluate)(evaluate, eval_options, common,
                                                               console);
     else

@@ -51,9 +51,7 @@ Camera cameraAt(const Room& room, const Vector3d& eye, const Vector3d& forward, 
   camera.width = width, camera.height = height;
   camera.fx = camera.fy = height / (2 * std::tan(kFieldOfView / 2));
   camera.cx = width / 2., camera.cy = height / 2.;
-  const Vector3d right = forward.cross(Vector3d::UnitZ()).normalized();
-  Eigen::Matrix3d room_from_camera;
-  room_from_camera << right, forward.cross(right), forward;
+  const Eigen::Matrix3d room_from_camera = lookAlong(forward, Vector3d::UnitZ());
   // Rebuilt in double: the float pose of the room is orthonormal to 1e-7 only.
   const Eigen::Quaterniond yaw(room.world_from_room.linear().cast<double>());
   camera.world_from_camera.linear() = yaw.normalized().toRotationMatrix() * room_from_camera *

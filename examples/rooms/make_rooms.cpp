@@ -63,17 +63,6 @@ std::vector<uint64_t> seedList(const std::string& text) {
   return seeds;
 }
 
-// One picture a tile, in rows.
-Image contactSheet(const std::vector<Image>& pictures, int columns) {
-  const int count = int(pictures.size());
-  columns = std::min(count, columns);
-  const int rows = (count + columns - 1) / columns, w = pictures[0].width, h = pictures[0].height;
-  Image sheet(columns * w, rows * h, 3, .15f);
-  for (int i = 0; i < count; ++i)
-    pasteImage(pictures[size_t(i)], i % columns * w, i / columns * h, &sheet);
-  return sheet;
-}
-
 void writeAovs(const RoomPicture& p, const std::string& path) {
   std::vector<float> depth = p.view.depth, material(p.material.begin(), p.material.end());
   for (float& z : depth)
@@ -127,7 +116,7 @@ void writeSheet(const std::vector<Image>& pictures, const std::string& folder) {
   std::vector<Image> tiles;
   for (const Image& picture : pictures)
     tiles.push_back(resizeImage(picture, kTileSide, tile_height));
-  writePng(contactSheet(tiles, kSheetColumns), folder + "/sheet.png");
+  writePng(tileImages(tiles, kSheetColumns), folder + "/sheet.png");
 }
 
 void makeRooms(const AssetLibrary& assets, const Options& o) {
@@ -189,11 +178,7 @@ Image modelPicture(const AssetLibrary& assets, size_t model, int side) {
   camera.width = camera.height = side;
   camera.fx = camera.fy = 1.7 * side;
   camera.cx = camera.cy = side / 2.;
-  const Eigen::Vector3d eye(1.5, 2.2, 1.5),
-      forward = (Eigen::Vector3d(0, 0, .42) - eye).normalized();
-  const Eigen::Vector3d right = forward.cross(Eigen::Vector3d::UnitZ()).normalized();
-  camera.world_from_camera.linear() << right, forward.cross(right), forward;
-  camera.world_from_camera.translation() = eye;
+  camera.world_from_camera = lookAt({1.5, 2.2, 1.5}, {0, 0, .42}, Eigen::Vector3d::UnitZ());
   return RoomRenderer(room).render(camera, 16, 1).colour;
 }
 
@@ -205,7 +190,7 @@ void makeModelSheet(const AssetLibrary& assets, const std::string& path) {
     if (m.role != "none" && m.fault.empty()) pictures.push_back(modelPicture(assets, i, kSide));
   }
   require(!pictures.empty(), "make_rooms models: expected usable models, found none");
-  writePng(contactSheet(pictures, kColumns), path);
+  writePng(tileImages(pictures, kColumns), path);
   std::printf("%zu models\n", pictures.size());
 }
 
