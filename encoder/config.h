@@ -27,6 +27,7 @@ struct EncoderConfig {
   float guide_alpha = -1;          // fixed share of learned attention, or -1: learned, starts at .5
   bool guide_log_counts = false;   // softmax(log(1 + count)) instead of softmax(count)
   float false_positives = 0.25f;   // injected when splitting, as a share of the truth
+  PositionConfig positions;
 
   static EncoderConfig small() { return {}; }
   /// The paper's sizes: M = 216, width 512, 12 heads-worth of attention; for GPUs.
