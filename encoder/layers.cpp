@@ -109,24 +109,60 @@ namespace {
 Tensor splitHeads(const Tensor& x, int heads) {  // [N, C] -> [H, N, C / H]
   return x.view({x.size(0), heads, -1}).transpose(0, 1);
 }
+Tensor joinHeads(const Tensor& x) {  // [H, N, C / H] -> [N, C]
+  return x.transpose(0, 1).reshape({x.size(1), -1});
+}
+
+// Values [H, M, C / H] weighed by how well their keys answer the queries [H, N, C / H].
+Tensor weigh(const Tensor& q, const Tensor& k, const Tensor& v, const Tensor& blocked = {}) {
+  const double scale = 1 / std::sqrt(double(q.size(2)));
+  Tensor a = torch::matmul(q * scale, k.transpose(1, 2));
+  if (blocked.defined()) a = a + blocked;
+  return torch::matmul(a.softmax(-1), v);
+}
+
+// A layer's results for rows [N, C].
+Tensor through(Linear& layer, const Tensor& rows) {
+  return inRowBlocks(rows.size(0), [&](int64_t begin, int64_t end) {
+    return layer->forward(rowsOf(rows, begin, end));
+  });
+}
 }  // namespace
 
 Attention::Context Attention::contextOf(const Tensor& rows, const Rotary* pos) {
-  const auto through = [&](Linear& layer) {
-    return inRowBlocks(rows.size(0), [&](int64_t begin, int64_t end) {
-      return layer->forward(rowsOf(rows, begin, end));
-    });
-  };
-  const Tensor keys = splitHeads(through(key), heads);
-  return {pos ? rotate(keys, *pos) : keys, through(value)};
+  const Tensor keys = splitHeads(through(key, rows), heads);
+  return {pos ? rotate(keys, *pos) : keys, through(value, rows)};
 }
 
 Tensor Attention::attend(const Tensor& x, const Rotary* pos, const Context& context) {
-  Tensor q = splitHeads(query->forward(x), heads);
+  const Tensor q = splitHeads(query->forward(x), heads);
+  return joinHeads(
+      weigh(pos ? rotate(q, *pos) : q, context.keys, splitHeads(context.values, heads)));
+}
+
+Tensor Attention::attendInWindows(const Tensor& x, const Rotary* pos, int64_t window,
+                                  int64_t lead) {
+  const int64_t n = x.size(0);
+  const Context context = contextOf(x, pos);
+  Tensor q = splitHeads(through(query, x), heads);
   if (pos) q = rotate(q, *pos);
-  const double scale = 1 / std::sqrt(double(q.size(2)));
-  const Tensor a = torch::matmul(q * scale, context.keys.transpose(1, 2)).softmax(-1);
-  return torch::matmul(a, splitHeads(context.values, heads)).transpose(0, 1).reshape(x.sizes());
+  const Tensor v = splitHeads(context.values, heads);
+  std::vector<Tensor> parts(size_t((n + lead + window - 1) / window));
+  inTasks(int64_t(parts.size()), [&](int64_t i) {
+    const int64_t start = i * window - lead, begin = std::max<int64_t>(0, start),
+                  end = std::min(n, start + window);
+    // The first and the last window may be partly empty: padded and blocked, they round as a full
+    // one does.
+    const int64_t before = begin - start, after = start + window - end;
+    const auto cut = [&](const Tensor& t) {
+      return torch::constant_pad_nd(t.slice(1, begin, end), {0, 0, before, after});
+    };
+    Tensor blocked = torch::zeros({window});
+    blocked.slice(0, 0, before).fill_(-1e9f), blocked.slice(0, window - after).fill_(-1e9f);
+    parts[size_t(i)] = joinHeads(
+        weigh(cut(q), cut(context.keys), cut(v), blocked).slice(1, before, window - after));
+  });
+  return torch::cat(parts);
 }
 
 Mlp::Mlp(int in, int hidden, int out) {
@@ -154,18 +190,21 @@ Tensor SelfBlock::forward(const Tensor& x, const Rotary* pos) {
 
 Tensor SelfBlock::windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,
                            bool shifted) {
-  const int64_t n = x.size(0), lead = shifted ? window / 2 : 0;
+  const int64_t n = x.size(0);
   if (n <= window) return forward(x, pos);
-  std::vector<Tensor> parts(size_t((n + lead + window - 1) / window));
-  inTasks(int64_t(parts.size()), [&](int64_t i) {
-    const int64_t begin = i * window - lead;
-    const Tensor rows = order.slice(0, std::max<int64_t>(0, begin), std::min(n, begin + window));
-    const Rotary p = pos ? pos->select(rows) : Rotary();
-    parts[size_t(i)] = forward(x.index_select(0, rows), pos ? &p : nullptr);
-  });
+  const Tensor sorted = x.index_select(0, order);
+  const Rotary p = pos ? pos->select(order) : Rotary();
+  const Tensor seen = attention->attendInWindows(norm1->forward(sorted), pos ? &p : nullptr, window,
+                                                 shifted ? window / 2 : 0);
   Tensor inverse = torch::empty_like(order);
   inverse.index_put_({order}, torch::arange(n));
-  return torch::cat(parts).index_select(0, inverse);
+  return inRowBlocks(n,
+                     [&](int64_t begin, int64_t end) {
+                       const Tensor y = rowsOf(sorted, begin, end) +
+                                        attention->output->forward(rowsOf(seen, begin, end));
+                       return y + mlp->forward(norm2->forward(y));
+                     })
+      .index_select(0, inverse);
 }
 
 void initialiseXavier(nn::Module& module) {

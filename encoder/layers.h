@@ -82,7 +82,9 @@ struct Attention : torch::nn::Module {
   Context contextOf(const Tensor& rows, const Rotary* pos);
   /// Queries from [N, C]. Returns [N, C], before the output projection.
   Tensor attend(const Tensor& x, const Rotary* pos, const Context& context);
-  /// The same, projected.
+  /// The same of self-attention within windows of `window` rows, the first one `lead` rows early.
+  Tensor attendInWindows(const Tensor& x, const Rotary* pos, int64_t window, int64_t lead);
+  /// attend(), projected.
   Tensor forward(const Tensor& x, const Rotary* pos, const Context& context) {
     return output->forward(attend(x, pos, context));
   }
