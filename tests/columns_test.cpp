@@ -20,7 +20,7 @@ namespace {
 using Rows = std::vector<std::vector<double>>;
 
 struct Counter {
-  int last;
+  int last = 0;
   int operator()() { return ++last; }
   float real() { return float(++last); }
 };
@@ -101,9 +101,9 @@ Rows rowsOf(const Gaussians& g) {
 }
 
 template <typename T>
-T tableOf(int64_t rows, int first = 0) {
+T tableOf(int64_t rows) {
   T t;
-  fill(rows, Counter{first}, &t);
+  fill(rows, Counter(), &t);
   return t;
 }
 
@@ -197,9 +197,8 @@ TYPED_TEST(Columns, ATableIsAppendedToItself) {
 TYPED_TEST(Columns, AnyOtherLengthIsRefused) {
   const TypeParam t = tableOf<TypeParam>(3);
   EXPECT_NO_THROW(requireRows(t, "test"));
-  bool first = true;  // the column that size() counts: the others are wrong then
   for (const bool longer : {false, true}) {
-    first = true;
+    bool first = true;  // the column that size() counts: the others are named then
     forEachCopy(t, [&](const TypeParam& copy, auto column) {
       SCOPED_TRACE(column.name);
       column.values.resize(longer ? column.values.size() + 1 : column.values.size() - 1);
@@ -214,6 +213,9 @@ TYPED_TEST(Columns, AnyOtherLengthIsRefused) {
       TypeParam whole = t;
       EXPECT_THROW(appendRows(&whole, copy), Error);
       EXPECT_EQ(rowsOf(whole), rowsOf(t));
+      TypeParam uneven = copy;
+      EXPECT_THROW(appendRows(&uneven, t), Error);
+      EXPECT_TRUE(equalRows(uneven, copy));
       first = false;
     });
   }
