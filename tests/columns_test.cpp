@@ -8,6 +8,7 @@
 #include <tuple>
 
 #include "splat/gaussians.h"
+#include "splat/points_vdb.h"
 #include "vdb/place.h"
 #include "vdb/scene_vdb.h"
 
@@ -100,6 +101,21 @@ Rows rowsOf(const Gaussians& g) {
   return rows;
 }
 
+void fill(int64_t rows, Counter next, Provenance* p) {
+  p->recorded = true;
+  for (int64_t i = 0; i < rows; ++i) {
+    p->generated.push_back(uint8_t(next()));
+    p->probability.push_back(next.real());
+  }
+}
+auto besidesRows(const Provenance& p) { return std::make_tuple(p.recorded); }
+Rows rowsOf(const Provenance& p) {
+  Rows rows;
+  for (size_t i = 0; i < p.generated.size(); ++i)
+    rows.push_back({double(p.generated[i]), p.probability.at(i)});
+  return rows;
+}
+
 template <typename T>
 T tableOf(int64_t rows) {
   T t;
@@ -146,7 +162,7 @@ void forEachCopy(const T& t, const Visit& visit) {
 
 template <typename T>
 class Columns : public testing::Test {};
-using Tables = testing::Types<Place, SceneVoxels, Gaussians>;
+using Tables = testing::Types<Place, SceneVoxels, Gaussians, Provenance>;
 TYPED_TEST_SUITE(Columns, Tables);
 
 TYPED_TEST(Columns, AllRowsSelectedAreTheTable) {
