@@ -1,5 +1,5 @@
-// Laws of the volume that is fitted to views: gravity and walls are found, T^-1 T = id (spec E3),
-// the box holds what was seen.
+// Laws of the volume that is fitted to views: gravity and walls are found, the box holds what was
+// seen, the transform's inverse is exact.
 #include "vdb/fit_volume.h"
 
 #include <gtest/gtest.h>

@@ -89,14 +89,20 @@ T keepRows(T t, const Keep& keep) {
   return selectRows(std::move(t), rows);
 }
 
-/// Appends the rows of `more`. Throws Error where a row of it has other widths.
+/// Appends the rows of `more`. Throws Error, with nothing appended, where its rows have other
+/// widths or the columns of either hold different numbers of rows.
 template <typename T>
 void appendRows(T* t, const T& more) {
+  requireRows(*t, "appendRows");
   requireRows(more, "appendRows");
   forEachColumn(
-      [](auto to, const auto& from) {
+      [](const auto& to, const auto& from) {
         require(to.width == from.width, "appendRows: expected ", to.width, " values of ", to.name,
                 " a row, found ", from.width);
+      },
+      *t, more);
+  forEachColumn(
+      [](auto to, const auto& from) {
         // Not insert(): `more` may be `*t`.
         const size_t before = to.values.size(), count = from.values.size();
         to.values.resize(before + count);
