@@ -418,14 +418,13 @@ TEST(Carve, RealFramesMatchTraversal) {
   if (!std::filesystem::exists(folder)) GTEST_SKIP() << folder << " is absent";
   ReadViewsSettings reading;
   reading.frames = {0, 9};
-  reading.max_side = 320;
   std::vector<OwnedView> views;
   for (const View& v : readViews(folder, reading)) views.push_back({v.camera, v.depth});
   for (const float voxel_m : {0.1f, 0.04f}) {
     VoxelFrame frame;
     frame.voxel_m = voxel_m;
     const int n = int(4 / voxel_m);
-    const Vector3d middle = views[0].camera.unproject(160, 120, 2) / double(voxel_m);
+    const Vector3d middle = views[0].camera.unproject(320, 240, 2) / double(voxel_m);
     const Coord centre(int(middle.x()), int(middle.y()), int(middle.z()));
     frame.bounds = CoordBBox(centre.offsetBy(-n), centre.offsetBy(n));
     expectSameAsTraversal(frame, views, {}, joinText("voxel ", voxel_m));
