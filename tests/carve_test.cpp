@@ -5,8 +5,6 @@
 #include <tbb/global_control.h>
 
 #include <cmath>
-#include <cstdlib>
-#include <filesystem>
 #include <functional>
 #include <limits>
 #include <random>
@@ -14,6 +12,7 @@
 
 #include "encoder/views/read_views.h"
 #include "splat/view.h"
+#include "tests/files.h"
 #include "vdb/error.h"
 
 namespace vdbc {
@@ -412,10 +411,8 @@ TEST(Carve, CanBeInterrupted) {
 }
 
 TEST(Carve, RealFramesMatchTraversal) {
-  const char* shared = std::getenv("VDBC_SHARED");
-  const std::string folder =
-      (shared ? std::string(shared) : VDBC_SOURCE_DIR "/../shared") + "/data/rgbd_redkitchen";
-  if (!std::filesystem::exists(folder)) GTEST_SKIP() << folder << " is absent";
+  const std::string folder = sharedFile("data/rgbd_redkitchen");
+  if (folder.empty()) GTEST_SKIP() << "no kitchen";
   ReadViewsSettings reading;
   reading.frames = {0, 9};
   std::vector<OwnedView> views;

@@ -36,17 +36,5 @@ TEST(Gaussians, ArraysOfDifferentLengthsThrow) {
   }
 }
 
-TEST(Gaussians, RowsAreChosenAndAppendedWhole) {
-  const Gaussians g = someGaussians(5, 2, 1);
-  Gaussians parts = selectRows(g, {0, 1});
-  appendRows(&parts, selectRows(g, {2, 3, 4}));
-  EXPECT_TRUE(equalRows(parts, g));
-  EXPECT_EQ(parts.sh_degree, 2);
-  const Gaussians swapped = selectRows(g, {4, 0});
-  EXPECT_EQ(swapped.mean[0], g.mean[4]);
-  EXPECT_EQ(swapped.sh[27 + 5], g.sh[5]);  // the second Gaussian is the first of before
-  EXPECT_THROW(appendRows(&parts, someGaussians(1, 0, 1)), Error);  // of another degree
-}
-
 }  // namespace
 }  // namespace vdbc

@@ -4,7 +4,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
 #include <cstring>
 #include <filesystem>
 #include <limits>
@@ -275,14 +274,9 @@ TEST_F(Ply, FilesSayWhetherTheyAreAntialiased) {
 
 // ---- files by others
 
-std::string sharedData() {
-  const char* shared = std::getenv("VDBC_SHARED");
-  return (shared ? std::string(shared) : VDBC_SOURCE_DIR "/../shared") + "/data/";
-}
-
 TEST_F(Ply, DonutReadsWhole) {
-  const std::string donut = sharedData() + "splats/donut.ply";
-  if (!fs::exists(donut)) GTEST_SKIP() << "no " << donut;
+  const std::string donut = sharedFile("data/splats/donut.ply");
+  if (donut.empty()) GTEST_SKIP() << "no donut.ply";
   const Gaussians g = readPly(donut);
   ASSERT_EQ(g.size(), 45624);
   EXPECT_EQ(g.sh_degree, 0);
@@ -295,10 +289,11 @@ TEST_F(Ply, DonutReadsWhole) {
 }
 
 TEST_F(Ply, ForeignFilesAreRefusedClearly) {
-  if (!fs::exists(sharedData())) GTEST_SKIP() << "no " << sharedData();
-  expectError([&] { readPly(sharedData() + "splats/guitar.compressed.ply"); },
+  const std::string splats = sharedFile("data/splats");
+  if (splats.empty()) GTEST_SKIP() << "no splats by others";
+  expectError([&] { readPly(splats + "/guitar.compressed.ply"); },
               {"guitar.compressed.ply", "compressed PLY is not supported"});
-  expectError([&] { readPly(sharedData() + "splats/minimal/minimal.splat"); }, {"not a PLY"});
+  expectError([&] { readPly(splats + "/minimal/minimal.splat"); }, {"not a PLY"});
 }
 
 }  // namespace

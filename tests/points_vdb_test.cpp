@@ -6,7 +6,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
 #include <filesystem>
 #include <map>
 #include <random>
@@ -250,16 +249,11 @@ TEST_F(PointsVdb, ADegreeThatTheColoursDoNotReachIsRefused) {
 
 // ---- files by others
 
-std::string sharedData() {
-  const char* shared = std::getenv("VDBC_SHARED");
-  return (shared ? std::string(shared) : VDBC_SOURCE_DIR "/../shared") + "/data/";
-}
-
 TEST_F(PointsVdb, ForeignFilesAreRefusedClearly) {
-  if (!fs::exists(sharedData())) GTEST_SKIP() << "no " << sharedData();
-  expectError([&] { readPointsVdb(sharedData() + "vdb/points.vdb"); }, {"points.vdb", "no splats"});
-  expectError([&] { readPointsVdb(sharedData() + "vdb/smoke.vdb"); },
-              {"smoke.vdb", "no splats", "density"});
+  const std::string vdb = sharedFile("data/vdb");
+  if (vdb.empty()) GTEST_SKIP() << "no grids by others";
+  expectError([&] { readPointsVdb(vdb + "/points.vdb"); }, {"points.vdb", "no splats"});
+  expectError([&] { readPointsVdb(vdb + "/smoke.vdb"); }, {"smoke.vdb", "no splats", "density"});
 }
 
 }  // namespace
