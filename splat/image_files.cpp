@@ -26,12 +26,33 @@ constexpr uint64_t kMaxPngExpansion = 1040;
 constexpr uint64_t kMaxJpegPixelsPerByte = 8 * 64;
 
 /// Decoded samples as stored, interleaved; 16-bit samples are in native byte order.
-struct RawImage {
+struct Samples {
   int width = 0, height = 0, channels = 0, bits = 0;
   std::vector<uint8_t> bytes;
 
   size_t rowBytes() const { return size_t(width) * size_t(channels) * size_t(bits / 8); }
 };
+
+/// A file in memory, and how to complain about it.
+struct Encoded {
+  const char* operation;
+  const std::string& name;
+  const uint8_t* bytes;
+  size_t size;
+
+  template <typename... Parts>
+  void require(bool condition, const Parts&... parts) const {
+    vdbc::require(condition, operation, ": ", name, ": ", parts...);
+  }
+  bool startsWith(std::initializer_list<uint8_t> magic) const {
+    return size >= magic.size() && std::equal(magic.begin(), magic.end(), bytes);
+  }
+  bool isPng() const { return startsWith({0x89, 'P', 'N', 'G', '\r', '\n', 0x1a, '\n'}); }
+};
+
+/// What samples to make of a file: 1 or 3 channels of 8 or 16 bits as they are stored, without
+/// alpha; 16-bit grey and nothing else; or 8-bit RGBA.
+enum class Want { kColour, kGrey16, kRgba8 };
 
 // ---- PNG. libpng reports errors by longjmp: the functions between setjmp and longjmp hold nothing
 // with a destructor.
@@ -58,7 +79,8 @@ void readPngBytes(png_structp png, png_bytep to, size_t count) {
 }
 
 /// Reads up to the first row; false with source->message set on failure.
-bool startPng(png_structp png, png_infop info, PngSource* source, RawImage* image, bool* grey16) {
+bool startPng(png_structp png, png_infop info, PngSource* source, Want want, Samples* image,
+              bool* grey16) {
   if (setjmp(png_jmpbuf(png))) return false;
   png_set_read_fn(png, source, readPngBytes);
   png_read_info(png, info);
@@ -67,10 +89,17 @@ bool startPng(png_structp png, png_infop info, PngSource* source, RawImage* imag
   png_get_IHDR(png, info, &width, &height, &bits, &type, nullptr, nullptr, nullptr);
   *grey16 = type == PNG_COLOR_TYPE_GRAY && bits == 16;
   if (uint64_t(width) * height > kMaxPixels) png_error(png, "more than 2^28 pixels");
-  if (type == PNG_COLOR_TYPE_PALETTE) png_set_palette_to_rgb(png);
-  if (type == PNG_COLOR_TYPE_GRAY && bits < 8) png_set_expand_gray_1_2_4_to_8(png);
-  if (type & PNG_COLOR_MASK_ALPHA) png_set_strip_alpha(png);
-  if (bits == 16) png_set_swap(png);  // PNG is big endian
+  if (want == Want::kRgba8) {
+    png_set_expand(png);
+    png_set_scale_16(png);
+    png_set_gray_to_rgb(png);
+    png_set_add_alpha(png, 0xff, PNG_FILLER_AFTER);
+  } else {
+    if (type == PNG_COLOR_TYPE_PALETTE) png_set_palette_to_rgb(png);
+    if (type == PNG_COLOR_TYPE_GRAY && bits < 8) png_set_expand_gray_1_2_4_to_8(png);
+    if (type & PNG_COLOR_MASK_ALPHA) png_set_strip_alpha(png);
+    if (bits == 16) png_set_swap(png);  // PNG is big endian
+  }
   png_set_interlace_handling(png);
   png_read_update_info(png, info);
   image->width = int(width), image->height = int(height);
@@ -90,34 +119,31 @@ bool finishPng(png_structp png, PngSource*, uint8_t** rows) {
   return true;
 }
 
-RawImage decodePng(const char* operation, const std::string& path,
-                   const std::vector<uint8_t>& bytes, bool only_grey16) {
+Samples decodePng(const Encoded& from, Want want) {
   struct Handles {
     PngSource source;
     png_structp png = nullptr;
     png_infop info = nullptr;
     ~Handles() { png_destroy_read_struct(&png, &info, nullptr); }
   } h;
-  h.source = {bytes.data(), bytes.size(), 0, ""};
+  h.source = {from.bytes, from.size, 0, ""};
   h.png = png_create_read_struct(PNG_LIBPNG_VER_STRING, h.source.message, onPngError, onPngWarning);
   if (h.png) h.info = png_create_info_struct(h.png);
-  require(h.png && h.info, operation, ": ", path, ": libpng cannot start");
-  RawImage image;
+  from.require(h.png && h.info, "libpng cannot start");
+  Samples image;
   bool grey16 = false;
-  require(startPng(h.png, h.info, &h.source, &image, &grey16), operation, ": ", path,
-          ": corrupt PNG: ", h.source.message);
-  require(!only_grey16 || grey16, operation, ": ", path,
-          ": expected a 16-bit greyscale PNG, found ", image.bits, " bits and ", image.channels,
-          " channels");
+  from.require(startPng(h.png, h.info, &h.source, want, &image, &grey16),
+               "corrupt PNG: ", h.source.message);
+  from.require(want != Want::kGrey16 || grey16, "expected a 16-bit greyscale PNG, found ",
+               image.bits, " bits and ", image.channels, " channels");
   image.bytes.resize(image.rowBytes() * size_t(image.height));
   std::vector<uint8_t*> rows(size_t(image.height));
   for (size_t y = 0; y < rows.size(); ++y) rows[y] = image.bytes.data() + y * image.rowBytes();
-  require(finishPng(h.png, &h.source, rows.data()), operation, ": ", path,
-          ": corrupt PNG: ", h.source.message);
+  from.require(finishPng(h.png, &h.source, rows.data()), "corrupt PNG: ", h.source.message);
   return image;
 }
 
-bool encodePng(png_structp png, png_infop info, std::FILE* file, const RawImage& image,
+bool encodePng(png_structp png, png_infop info, std::FILE* file, const Samples& image,
                uint8_t** rows) {
   if (setjmp(png_jmpbuf(png))) return false;
   png_init_io(png, file);
@@ -132,7 +158,7 @@ bool encodePng(png_structp png, png_infop info, std::FILE* file, const RawImage&
   return true;
 }
 
-void savePng(const char* operation, const RawImage& image, const std::string& path) {
+void savePng(const char* operation, const Samples& image, const std::string& path) {
   struct Handles {
     char message[sizeof(PngSource::message)] = "";
     png_structp png = nullptr;
@@ -180,16 +206,15 @@ void onJpegMessage(j_common_ptr jpeg, int level) {
   if (level < 0 && jpeg->err->msg_code != JWRN_EXTRANEOUS_DATA) onJpegError(jpeg);
 }
 
-bool startJpeg(jpeg_decompress_struct* jpeg, JpegErrors* errors,
-               const std::vector<uint8_t>& bytes) {
+bool startJpeg(jpeg_decompress_struct* jpeg, JpegErrors* errors, const Encoded& from) {
   if (setjmp(errors->jump)) return false;
   jpeg_create_decompress(jpeg);
-  jpeg_mem_src(jpeg, bytes.data(), static_cast<unsigned long>(bytes.size()));
+  jpeg_mem_src(jpeg, from.bytes, static_cast<unsigned long>(from.size));
   jpeg_read_header(jpeg, TRUE);
   return true;
 }
 
-bool finishJpeg(jpeg_decompress_struct* jpeg, JpegErrors* errors, RawImage* image) {
+bool finishJpeg(jpeg_decompress_struct* jpeg, JpegErrors* errors, Samples* image) {
   if (setjmp(errors->jump)) return false;
   jpeg_start_decompress(jpeg);
   while (jpeg->output_scanline < jpeg->output_height) {
@@ -200,8 +225,7 @@ bool finishJpeg(jpeg_decompress_struct* jpeg, JpegErrors* errors, RawImage* imag
   return true;
 }
 
-RawImage decodeJpeg(const char* operation, const std::string& path,
-                    const std::vector<uint8_t>& bytes) {
+Samples decodeJpeg(const Encoded& from, Want want) {
   struct Handles {
     jpeg_decompress_struct jpeg{};
     JpegErrors errors{};
@@ -210,52 +234,43 @@ RawImage decodeJpeg(const char* operation, const std::string& path,
   h.jpeg.err = jpeg_std_error(&h.errors.base);
   h.errors.base.error_exit = onJpegError;
   h.errors.base.emit_message = onJpegMessage;
-  require(startJpeg(&h.jpeg, &h.errors, bytes), operation, ": ", path,
-          ": corrupt JPEG: ", h.errors.message);
+  from.require(startJpeg(&h.jpeg, &h.errors, from), "corrupt JPEG: ", h.errors.message);
   const uint64_t pixels = uint64_t(h.jpeg.image_width) * h.jpeg.image_height;
-  require(pixels <= kMaxPixels, operation, ": ", path, ": more than 2^28 pixels (",
-          h.jpeg.image_width, " x ", h.jpeg.image_height, ")");
-  require(pixels / kMaxJpegPixelsPerByte <= bytes.size(), operation, ": ", path,
-          ": corrupt JPEG: ", bytes.size(), " bytes are too few for ", h.jpeg.image_width, " x ",
-          h.jpeg.image_height, " pixels");
+  from.require(pixels <= kMaxPixels, "more than 2^28 pixels (", h.jpeg.image_width, " x ",
+               h.jpeg.image_height, ")");
+  from.require(pixels / kMaxJpegPixelsPerByte <= from.size, "corrupt JPEG: ", from.size,
+               " bytes are too few for ", h.jpeg.image_width, " x ", h.jpeg.image_height,
+               " pixels");
   const J_COLOR_SPACE space = h.jpeg.jpeg_color_space;
-  require(space == JCS_GRAYSCALE || space == JCS_YCbCr || space == JCS_RGB, operation, ": ", path,
-          ": expected a greyscale or RGB JPEG, found CMYK or another colour space");
-  h.jpeg.out_color_space = space == JCS_GRAYSCALE ? JCS_GRAYSCALE : JCS_RGB;
-  RawImage image;
+  from.require(space == JCS_GRAYSCALE || space == JCS_YCbCr || space == JCS_RGB,
+               "expected a greyscale or RGB JPEG, found CMYK or another colour space");
+  const bool is_grey = space == JCS_GRAYSCALE && want != Want::kRgba8;
+  h.jpeg.out_color_space = is_grey ? JCS_GRAYSCALE : JCS_RGB;
+  Samples image;
   image.width = int(h.jpeg.image_width), image.height = int(h.jpeg.image_height);
-  image.channels = space == JCS_GRAYSCALE ? 1 : 3;
+  image.channels = is_grey ? 1 : 3;
   image.bits = 8;
   image.bytes.resize(image.rowBytes() * size_t(image.height));
-  require(finishJpeg(&h.jpeg, &h.errors, &image), operation, ": ", path,
-          ": corrupt JPEG: ", h.errors.message);
+  from.require(finishJpeg(&h.jpeg, &h.errors, &image), "corrupt JPEG: ", h.errors.message);
   return image;
 }
 
-bool startsWith(const std::vector<uint8_t>& bytes, std::initializer_list<uint8_t> magic) {
-  return bytes.size() >= magic.size() && std::equal(magic.begin(), magic.end(), bytes.begin());
-}
-
-bool isPng(const std::vector<uint8_t>& bytes) {
-  return startsWith(bytes, {0x89, 'P', 'N', 'G', '\r', '\n', 0x1a, '\n'});
+Samples decode(const Encoded& from, Want want) {
+  from.require(from.size > 0, "file is empty");
+  if (from.isPng()) return decodePng(from, want);
+  from.require(want != Want::kGrey16, "expected a PNG file, found another format");
+  from.require(from.startsWith({0xff, 0xd8, 0xff}),
+               "expected a PNG or JPEG file, found another format");
+  return decodeJpeg(from, want);
 }
 
 }  // namespace
 
-Image readImage(const std::string& path) {
-  constexpr const char* kOperation = "readImage";
-  const std::vector<uint8_t> bytes = readFile(kOperation, path, kMaxFileBytes);
-  require(!bytes.empty(), kOperation, ": ", path, ": file is empty");
-  RawImage raw;
-  if (isPng(bytes)) {
-    raw = decodePng(kOperation, path, bytes, false);
-  } else {
-    require(startsWith(bytes, {0xff, 0xd8, 0xff}), kOperation, ": ", path,
-            ": expected a PNG or JPEG file, found another format");
-    raw = decodeJpeg(kOperation, path, bytes);
-  }
-  require(raw.channels == 1 || raw.channels == 3, kOperation, ": ", path,
-          ": expected 1 or 3 channels, found ", raw.channels);
+Image decodeImage(const char* operation, const std::string& name, const void* bytes, size_t size) {
+  const Encoded from{operation, name, static_cast<const uint8_t*>(bytes), size};
+  const Samples raw = decode(from, Want::kColour);
+  from.require(raw.channels == 1 || raw.channels == 3, "expected 1 or 3 channels, found ",
+               raw.channels);
   Image image(raw.width, raw.height, raw.channels);
   const size_t n = image.data.size();
   if (raw.bits == 8) {
@@ -272,11 +287,28 @@ Image readImage(const std::string& path) {
   return image;
 }
 
+std::vector<uint8_t> decodeRgba(const char* operation, const std::string& name, const void* bytes,
+                                size_t size, int* width, int* height) {
+  const Encoded from{operation, name, static_cast<const uint8_t*>(bytes), size};
+  Samples raw = decode(from, Want::kRgba8);
+  *width = raw.width, *height = raw.height;
+  if (raw.channels == 4) return std::move(raw.bytes);
+  const size_t pixels = size_t(raw.width) * size_t(raw.height);
+  std::vector<uint8_t> rgba(4 * pixels, 0xff);
+  for (size_t i = 0; i < pixels; ++i) std::copy_n(&raw.bytes[3 * i], 3, &rgba[4 * i]);
+  return rgba;
+}
+
+Image readImage(const std::string& path) {
+  constexpr const char* kOperation = "readImage";
+  const std::vector<uint8_t> bytes = readFile(kOperation, path, kMaxFileBytes);
+  return decodeImage(kOperation, path, bytes.data(), bytes.size());
+}
+
 std::vector<uint16_t> readPng16(const std::string& path, int* width, int* height) {
   constexpr const char* kOperation = "readPng16";
   const std::vector<uint8_t> bytes = readFile(kOperation, path, kMaxFileBytes);
-  require(isPng(bytes), kOperation, ": ", path, ": expected a PNG file, found another format");
-  const RawImage raw = decodePng(kOperation, path, bytes, true);
+  const Samples raw = decode({kOperation, path, bytes.data(), bytes.size()}, Want::kGrey16);
   *width = raw.width, *height = raw.height;
   std::vector<uint16_t> values(size_t(raw.width) * size_t(raw.height));
   std::memcpy(values.data(), raw.bytes.data(), raw.bytes.size());
@@ -288,7 +320,7 @@ void writePng(const Image& image, const std::string& path) {
   requireImage(kOperation, image);
   require(image.channels == 1 || image.channels == 3, kOperation, ": ", path,
           ": expected 1 or 3 channels, found ", image.channels);
-  RawImage raw{image.width, image.height, image.channels, 8, {}};
+  Samples raw{image.width, image.height, image.channels, 8, {}};
   raw.bytes.resize(image.data.size());
   for (size_t i = 0; i < image.data.size(); ++i) {
     const float v = image.data[i];
@@ -301,7 +333,7 @@ void writePng16(const std::vector<uint16_t>& data, int width, int height, const 
   constexpr const char* kOperation = "writePng16";
   require(width > 0 && height > 0 && data.size() == size_t(width) * size_t(height), kOperation,
           ": ", path, ": expected ", width, " x ", height, " values, found ", data.size());
-  RawImage raw{width, height, 1, 16, {}};
+  Samples raw{width, height, 1, 16, {}};
   raw.bytes.resize(data.size() * 2);
   std::memcpy(raw.bytes.data(), data.data(), raw.bytes.size());
   savePng(kOperation, raw, path);

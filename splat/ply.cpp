@@ -52,6 +52,35 @@ size_t plyTypeBytes(const std::string& type) {
   return 0;
 }
 
+/// Adds what a line `element NAME COUNT` says.
+void addElement(const std::string& line, const std::string& prefix, PlyHeader* header) {
+  std::istringstream words(line);
+  PlyElement element;
+  std::string keyword, count;
+  words >> keyword >> element.name >> count;
+  const char* end = count.data() + count.size();
+  const auto [stop, failure] = std::from_chars(count.data(), end, element.count);
+  require(!element.name.empty() && failure == std::errc() && stop == end, prefix,
+          "expected `element NAME COUNT`, found `", line, "`");
+  header->elements.push_back(element);
+}
+
+/// Adds what a line `property TYPE NAME` says to the last element.
+void addProperty(const std::string& line, const std::string& prefix, PlyHeader* header) {
+  std::istringstream words(line);
+  std::string keyword, type, name, extra;
+  words >> keyword >> type >> name >> extra;
+  require(type != "list", prefix, "list properties are not supported (found `", line, "`)");
+  const size_t size = plyTypeBytes(type);
+  require(!header->elements.empty() && size > 0 && !name.empty() && extra.empty(), prefix,
+          "expected `property TYPE NAME` of an element, found `", line, "`");
+  PlyElement& element = header->elements.back();
+  for (const PlyProperty& other : element.properties)
+    require(other.name != name, prefix, "property ", name, " is there twice");
+  element.properties.push_back({name, type, element.row_bytes});
+  element.row_bytes += size;
+}
+
 PlyHeader parsePlyHeader(const std::vector<uint8_t>& bytes, const std::string& path) {
   const std::string prefix = "readPly: " + path + ": ";
   const auto* begin = reinterpret_cast<const char*>(bytes.data());
@@ -66,42 +95,23 @@ PlyHeader parsePlyHeader(const std::vector<uint8_t>& bytes, const std::string& p
     header.bytes = end + 1;
     if (!line.empty() && line.back() == '\r') line.pop_back();
     std::istringstream words(line);
-    std::string keyword, first, second, extra;
-    words >> keyword;
+    std::string keyword, first, second;
+    words >> keyword >> first >> second;
     if (line_number == 0) {
       require(line == "ply", prefix, "not a PLY file");
     } else if (keyword == "comment") {
-      words >> first >> second;
       if (first == "SplatRenderMode:") header.antialias = second == kAntialiasedMode;
       if (first == "antialiased") header.antialias = second == "1";
     } else if (keyword == "obj_info" || keyword.empty()) {
       continue;
     } else if (keyword == "format") {
-      words >> first >> second;
       require(first == "binary_little_endian" && second == "1.0", prefix,
               "expected format binary_little_endian 1.0, found ", first, " ", second);
       format_seen = true;
     } else if (keyword == "element") {
-      words >> first >> second;
-      PlyElement element;
-      element.name = first;
-      const auto [stop, failure] =
-          std::from_chars(second.data(), second.data() + second.size(), element.count);
-      require(!first.empty() && failure == std::errc() && stop == second.data() + second.size(),
-              prefix, "expected `element NAME COUNT`, found `", line, "`");
-      header.elements.push_back(element);
+      addElement(line, prefix, &header);
     } else if (keyword == "property") {
-      words >> first >> second >> extra;
-      require(first != "list", prefix, "list properties are not supported (found `", line, "`)");
-      const size_t size = plyTypeBytes(first);
-      require(!header.elements.empty() && size > 0 && !second.empty() && extra.empty(), prefix,
-              "expected `property TYPE NAME` of an element, found `", line, "`");
-      PlyElement& element = header.elements.back();
-      for (const PlyProperty& other : element.properties) {
-        require(other.name != second, prefix, "property ", second, " is there twice");
-      }
-      element.properties.push_back({second, first, element.row_bytes});
-      element.row_bytes += size;
+      addProperty(line, prefix, &header);
     } else if (keyword == "end_header") {
       require(format_seen, prefix, "the header has no format line");
       return header;

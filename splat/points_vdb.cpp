@@ -19,6 +19,7 @@
 #include "vdb/file_io.h"
 #include "vdb/point_leaves.h"
 #include "vdb/vdb_file.h"
+#include "vdb/z_order.h"
 
 namespace vdbc {
 namespace {
@@ -42,21 +43,10 @@ constexpr float kMinNormalHalf = 6.103515625e-5f;
 // Index coordinates stay within +-2^19: layOutPoints() takes no more.
 constexpr int kIndexBits = 20;
 
-/// Bits of v spread to every third position.
-uint64_t spreadBits(uint64_t v) {
-  v &= 0x1fffff;
-  v = (v | v << 32) & 0x1f00000000ffffull;
-  v = (v | v << 16) & 0x1f0000ff0000ffull;
-  v = (v | v << 8) & 0x100f00f00f00f00full;
-  v = (v | v << 4) & 0x10c30c30c30c30c3ull;
-  v = (v | v << 2) & 0x1249249249249249ull;
-  return v;
-}
-
-/// The voxel edge (metres) at which occupied voxels hold about 8 points. Sorting the points once in
-/// Morton order gives the number of occupied cells at every level of an octree over their box:
-/// neighbours in that order share a cell down to the level where their codes part. The edge is
-/// interpolated between the two levels around the wanted count.
+/// The voxel edge (metres) at which occupied voxels hold about 8 points. Sorting the points once
+/// along the Z-order curve gives the number of occupied cells at every level of an octree over
+/// their box: neighbours in that order share a cell down to the level where their codes part. The
+/// edge is interpolated between the two levels around the wanted count.
 double pointsVoxelSize(const Gaussians& g, const std::vector<int64_t>& rows) {
   constexpr int kLevels = 21;
   if (rows.empty()) return 0.1;
@@ -71,8 +61,7 @@ double pointsVoxelSize(const Gaussians& g, const std::vector<int64_t>& rows) {
   const double cells = double((1 << kLevels) - 1) / extent;
   for (size_t i = 0; i < rows.size(); ++i) {
     const Eigen::Vector3d p = (g.mean[size_t(rows[i])].cast<double>() - box.min()) * cells;
-    codes[i] = spreadBits(uint64_t(p.x())) << 2 | spreadBits(uint64_t(p.y())) << 1 |
-               spreadBits(uint64_t(p.z()));
+    codes[i] = zOrderCode(uint64_t(p.x()), uint64_t(p.y()), uint64_t(p.z()));
   }
   tbb::parallel_sort(codes.begin(), codes.end());
   std::array<double, kLevels + 1> occupied{};  // by level; level l has cells of extent / 2^l
@@ -209,6 +198,7 @@ PointTree::Ptr buildPointTree(const Gaussians& g, const Provenance& provenance,
 struct SplatLeaf {
   const PointLeaf* leaf;
   size_t first_row;
+  openvdb::Index count;
 };
 
 /// The highest degree with a coefficient other than zero: what files by others leave to be found
@@ -232,10 +222,8 @@ int usedShDegree(const std::vector<SplatLeaf>& leaves) {
   return used;
 }
 
-void readLeaf(const SplatLeaf& source, const openvdb::math::Transform& transform, bool has_sh,
-              Gaussians* g, Provenance* provenance) {
+void readShapes(const SplatLeaf& source, const openvdb::math::Transform& transform, Gaussians* g) {
   const PointLeaf& leaf = *source.leaf;
-  const auto& descriptor = leaf.attributeSet().descriptor();
   const auto position = readHandle<Vec3f>(leaf, "P");
   const auto scale = readHandle<Vec3f>(leaf, "scale");
   const auto orient = readHandle<Quats>(leaf, "orient");
@@ -256,41 +244,39 @@ void readLeaf(const SplatLeaf& source, const openvdb::math::Transform& transform
     }
     begin = end;
   }
+}
+
+void readColours(const SplatLeaf& source, bool has_sh, Gaussians* g) {
   const size_t coefficients = size_t(g->shCoefficients());
-  if (has_sh) {
-    for (size_t c = 0; c < 3; ++c) {
-      const auto values = readHandle<float>(leaf, kShNames[c]);
-      require(values.stride() >= coefficients, kShNames[c], ": expected at least ", coefficients,
-              " values, found ", values.stride());
-      for (openvdb::Index n = 0; n < begin; ++n) {
-        for (size_t k = 0; k < coefficients; ++k) {
-          g->sh[((source.first_row + n) * coefficients + k) * 3 + c] =
-              values.get(n, openvdb::Index(k));
-        }
-      }
-    }
-  } else {
-    const auto colour = readHandle<Vec3f>(leaf, "Cd");
-    for (openvdb::Index n = 0; n < begin; ++n) {
+  float* sh = g->sh.data() + source.first_row * coefficients * 3;
+  if (!has_sh) {
+    const auto colour = readHandle<Vec3f>(*source.leaf, "Cd");
+    for (openvdb::Index n = 0; n < source.count; ++n) {
       const Vec3f linear = colour.get(n);
-      for (int c = 0; c < 3; ++c) {
-        g->sh[(source.first_row + n) * coefficients * 3 + size_t(c)] =
-            (srgbFromLinear(linear[c]) - 0.5f) / kSh0;
-      }
+      for (int c = 0; c < 3; ++c)
+        sh[n * coefficients * 3 + size_t(c)] = (srgbFromLinear(linear[c]) - 0.5f) / kSh0;
     }
+    return;
   }
-  if (!provenance) return;
+  for (size_t c = 0; c < 3; ++c) {
+    const auto values = readHandle<float>(*source.leaf, kShNames[c]);
+    for (openvdb::Index n = 0; n < source.count; ++n)
+      for (size_t k = 0; k < coefficients; ++k)
+        sh[(n * coefficients + k) * 3 + c] = values.get(n, openvdb::Index(k));
+  }
+}
+
+void readProvenance(const SplatLeaf& source, Provenance* provenance) {
+  const PointLeaf& leaf = *source.leaf;
   if (hasAttribute(leaf, "probability")) {
     const auto probability = readHandle<float>(leaf, "probability");
-    for (openvdb::Index n = 0; n < begin; ++n) {
+    for (openvdb::Index n = 0; n < source.count; ++n)
       provenance->probability[source.first_row + n] = probability.get(n);
-    }
   }
-  if (descriptor.hasGroup("completed")) {
+  if (leaf.attributeSet().descriptor().hasGroup("completed")) {
     const auto completed = leaf.groupHandle("completed");
-    for (openvdb::Index n = 0; n < begin; ++n) {
+    for (openvdb::Index n = 0; n < source.count; ++n)
       provenance->generated[source.first_row + n] = completed.get(n) ? 1 : 0;
-    }
   }
 }
 
@@ -325,7 +311,7 @@ Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenanc
     require(has_sh || has("Cd"), "readPointsVdb: ", path, ": no splats: points grid ",
             grid.getName(), " has no colour (expected GS_SPH_R/G/B or Cd)");
     const size_t points = checkedPointCount("readPointsVdb", *leaf, path);
-    leaves.push_back({&*leaf, count});
+    leaves.push_back({&*leaf, count, openvdb::Index(points)});
     count += points;
   }
   int degree = 0;
@@ -334,6 +320,13 @@ Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenanc
     degree = stored ? stored->value() : usedShDegree(leaves);
     require(degree >= 0 && degree <= 3, "readPointsVdb: ", path, ": expected sh_degree 0-3, found ",
             degree);
+    for (const SplatLeaf& l : leaves)
+      for (const char* name : kShNames) {
+        const openvdb::Index values = l.leaf->constAttributeArray(name).stride();
+        require(int(values) >= (degree + 1) * (degree + 1), "readPointsVdb: ", path,
+                ": expected at least ", (degree + 1) * (degree + 1), " values of ", name,
+                " for its sh_degree ", degree, ", found ", values);
+      }
   }
   Gaussians g;
   g.resize(int64_t(count), degree);
@@ -347,7 +340,9 @@ Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenanc
     provenance->probability.assign(count, 1.f);
   }
   tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {
-    readLeaf(leaves[i], grid.transform(), has_sh, &g, provenance);
+    readShapes(leaves[i], grid.transform(), &g);
+    readColours(leaves[i], has_sh, &g);
+    if (provenance) readProvenance(leaves[i], provenance);
   });
   const std::vector<int64_t> rows = finiteRows(g);
   if (int64_t(rows.size()) == g.size()) return g;

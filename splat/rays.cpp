@@ -31,12 +31,6 @@ struct VoxelBox {
   Eigen::Vector3f min;  // index space; the box is [min, min + 1]
 };
 
-struct Ellipsoid {
-  Eigen::Vector3f mean;       // metres
-  Eigen::Vector3f extent;     // half size of the axis-aligned bounds, metres
-  Eigen::Matrix3d unit_from;  // world offset from the mean -> unit sphere
-};
-
 struct Ray {
   Eigen::Vector3d origin, direction;
 };
@@ -56,36 +50,16 @@ double entry(const VoxelBox& box, const Ray& ray) {
   return near <= far ? near : std::numeric_limits<double>::infinity();
 }
 
-double entry(const Ellipsoid& e, const Ray& ray) {
-  constexpr double kMiss = std::numeric_limits<double>::infinity();
-  const Eigen::Vector3d q = e.unit_from * (ray.origin - e.mean.cast<double>());
-  const Eigen::Vector3d d = e.unit_from * ray.direction;
-  // About the point of closest approach: no cancellation for small ellipsoids far away.
-  const double middle = -q.dot(d) / d.squaredNorm();
-  const double h = 1 - (q + middle * d).squaredNorm();
-  if (!(h >= 0)) return kMiss;
-  const double half = std::sqrt(h / d.squaredNorm());
-  return middle + half < 0 ? kMiss : std::max(0., middle - half);
-}
-
-void setBounds(const VoxelBox& box, RTCBounds* b) {
+void boundsCallback(const RTCBoundsFunctionArguments* args) {
+  const VoxelBox& box = static_cast<const VoxelBox*>(args->geometryUserPtr)[args->primID];
+  RTCBounds* b = args->bounds_o;
   b->lower_x = box.min.x(), b->upper_x = box.min.x() + 1;
   b->lower_y = box.min.y(), b->upper_y = box.min.y() + 1;
   b->lower_z = box.min.z(), b->upper_z = box.min.z() + 1;
 }
-void setBounds(const Ellipsoid& e, RTCBounds* b) {
-  b->lower_x = e.mean.x() - e.extent.x(), b->upper_x = e.mean.x() + e.extent.x();
-  b->lower_y = e.mean.y() - e.extent.y(), b->upper_y = e.mean.y() + e.extent.y();
-  b->lower_z = e.mean.z() - e.extent.z(), b->upper_z = e.mean.z() + e.extent.z();
-}
 
-template <typename Solid>
-void boundsCallback(const RTCBoundsFunctionArguments* args) {
-  setBounds(static_cast<const Solid*>(args->geometryUserPtr)[args->primID], args->bounds_o);
-}
-
-template <typename Solid>
 void intersectCallback(const RTCIntersectFunctionNArguments* args) {
+  const VoxelBox& box = static_cast<const VoxelBox*>(args->geometryUserPtr)[args->primID];
   RTCRayN* rays = RTCRayHitN_RayN(args->rayhit, args->N);
   RTCHitN* hits = RTCRayHitN_HitN(args->rayhit, args->N);
   for (unsigned i = 0; i < args->N; ++i) {
@@ -94,8 +68,7 @@ void intersectCallback(const RTCIntersectFunctionNArguments* args) {
                    RTCRayN_org_z(rays, args->N, i)},
                   {RTCRayN_dir_x(rays, args->N, i), RTCRayN_dir_y(rays, args->N, i),
                    RTCRayN_dir_z(rays, args->N, i)}};
-    const float t =
-        float(entry(static_cast<const Solid*>(args->geometryUserPtr)[args->primID], ray));
+    const float t = float(entry(box, ray));
     if (!(t >= RTCRayN_tnear(rays, args->N, i) && t < RTCRayN_tfar(rays, args->N, i))) continue;
     RTCRayN_tfar(rays, args->N, i) = t;
     RTCHitN_geomID(hits, args->N, i) = args->geomID;
@@ -135,7 +108,6 @@ struct RayTarget::Impl {
   bool is_indexed = false;
   VoxelFrame frame;
   std::vector<VoxelBox> boxes;
-  std::vector<Ellipsoid> ellipsoids;
 
   Impl() : scene(rtcNewScene(embreeDevice())) {
     // Robust: rays must not slip through the edge shared by two triangles.
@@ -146,15 +118,6 @@ struct RayTarget::Impl {
   Impl(const Impl&) = delete;
   Impl& operator=(const Impl&) = delete;
 
-  template <typename Solid>
-  void attachSolids(std::vector<Solid>& solids) {
-    RTCGeometry geometry = rtcNewGeometry(embreeDevice(), RTC_GEOMETRY_TYPE_USER);
-    rtcSetGeometryUserPrimitiveCount(geometry, unsigned(solids.size()));
-    rtcSetGeometryUserData(geometry, solids.data());
-    rtcSetGeometryBoundsFunction(geometry, boundsCallback<Solid>, nullptr);
-    rtcSetGeometryIntersectFunction(geometry, intersectCallback<Solid>);
-    attach(geometry);
-  }
   void attach(RTCGeometry geometry) {
     rtcCommitGeometry(geometry);
     rtcAttachGeometry(scene, geometry);
@@ -199,39 +162,14 @@ RayTarget RayTarget::fromVoxels(const VoxelFrame& frame, const std::vector<Coord
   impl->boxes.reserve(voxels.size());
   for (const Coord& c : voxels)
     impl->boxes.push_back({Eigen::Vector3f(float(c.x()), float(c.y()), float(c.z()))});
-  impl->attachSolids(impl->boxes);
+  RTCGeometry geometry = rtcNewGeometry(embreeDevice(), RTC_GEOMETRY_TYPE_USER);
+  rtcSetGeometryUserPrimitiveCount(geometry, unsigned(impl->boxes.size()));
+  rtcSetGeometryUserData(geometry, impl->boxes.data());
+  rtcSetGeometryBoundsFunction(geometry, boundsCallback, nullptr);
+  rtcSetGeometryIntersectFunction(geometry, intersectCallback);
+  impl->attach(geometry);
   return RayTarget(std::move(impl));
 }
-
-RayTarget RayTarget::fromGaussians(const Gaussians& gaussians, float sigmas, float min_opacity) {
-  constexpr double kMinSigma = 1e-6;  // metres; keeps the inverse finite
-  requireConsistent(gaussians);
-  require(sigmas > 0, "RayTarget: expected a positive number of standard deviations, found ",
-          sigmas);
-  auto impl = std::make_unique<Impl>();
-  for (size_t i = 0; i < size_t(gaussians.size()); ++i) {
-    if (!(1 / (1 + std::exp(-gaussians.opacity_logit[i])) >= min_opacity)) continue;
-    const Eigen::Vector4d q = gaussians.rotation[i].cast<double>();
-    const Eigen::Quaterniond rotation =
-        q.norm() > 0 ? Eigen::Quaterniond(q[0], q[1], q[2], q[3]).normalized()
-                     : Eigen::Quaterniond::Identity();
-    const Eigen::Matrix3d r = rotation.toRotationMatrix();
-    const Eigen::Vector3d radius =
-        (gaussians.log_scale[i].cast<double>().array().exp().max(kMinSigma) * double(sigmas));
-    Ellipsoid e;
-    e.mean = gaussians.mean[i];
-    // Rounded up, so that the bounds never cut the ellipsoid.
-    e.extent = ((r * radius.asDiagonal()).rowwise().norm() * (1 + 1e-5)).cast<float>();
-    e.extent.array() += e.mean.array().abs() * 1e-6f + 1e-7f;
-    e.unit_from = radius.cwiseInverse().asDiagonal() * r.transpose();
-    if (e.mean.allFinite() && e.extent.allFinite() && e.unit_from.allFinite())
-      impl->ellipsoids.push_back(e);
-  }
-  impl->attachSolids(impl->ellipsoids);
-  return RayTarget(std::move(impl));
-}
-
-RTCSceneTy* RayTarget::embreeScene() const { return impl_->scene; }
 
 std::vector<float> RayTarget::trace(const std::vector<Eigen::Vector3f>& origins,
                                     const std::vector<Eigen::Vector3f>& directions) const {

@@ -1,13 +1,11 @@
 #pragma once
-// Geometry cross-checked by Embree: an independent ray caster over meshes, voxels and ellipsoids.
+// Rays against meshes and voxels, by Embree: where they end, and what they tell of a
+// reconstruction.
 #include <memory>
 #include <vector>
 
-#include "splat/gaussians.h"
 #include "splat/view.h"
 #include "vdb/carve.h"
-
-struct RTCSceneTy;
 
 namespace vdbc {
 
@@ -17,16 +15,14 @@ struct TriangleMesh {
   std::vector<Eigen::Vector3i> triangles;
 };
 
-/// Something rays can hit: triangles, the boxes of voxels, or the ellipsoids of Gaussians. Voxels
-/// and ellipsoids are solid: a ray that starts inside one hits it at distance 0.
+/// Something rays can hit: triangles, or the boxes of voxels. Boxes are solid: a ray that starts
+/// inside one hits it at distance 0.
 class RayTarget {
  public:
+  /// Both sides of every triangle. Throws Error where one names a vertex that is not there.
   static RayTarget fromMesh(const TriangleMesh& mesh);
+  /// Voxel ijk of `frame` is the box [ijk, ijk + 1) x voxel_m.
   static RayTarget fromVoxels(const VoxelFrame& frame, const std::vector<Coord>& voxels);
-  /// Ellipsoids at `sigmas` standard deviations of the Gaussians with opacity of at least
-  /// min_opacity.
-  static RayTarget fromGaussians(const Gaussians& gaussians, float sigmas = 1.5f,
-                                 float min_opacity = 0.3f);
   RayTarget(RayTarget&&) noexcept;
   RayTarget& operator=(RayTarget&&) noexcept;
   ~RayTarget();
@@ -34,10 +30,6 @@ class RayTarget {
   /// Distances (metres along unit directions) to the first hits, infinity where there is none. [N]
   std::vector<float> trace(const std::vector<Eigen::Vector3f>& origins,
                            const std::vector<Eigen::Vector3f>& directions) const;
-
-  /// The Embree scene (an RTCScene), for renderers that trace packets themselves. Of a mesh it is
-  /// one triangle geometry in world coordinates, primitive i = triangle i; owned by this object.
-  RTCSceneTy* embreeScene() const;
 
  private:
   struct Impl;

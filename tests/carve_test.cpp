@@ -5,8 +5,6 @@
 #include <tbb/global_control.h>
 
 #include <cmath>
-#include <cstdlib>
-#include <filesystem>
 #include <functional>
 #include <limits>
 #include <random>
@@ -14,6 +12,7 @@
 
 #include "encoder/views/read_views.h"
 #include "splat/view.h"
+#include "tests/files.h"
 #include "vdb/error.h"
 
 namespace vdbc {
@@ -412,20 +411,17 @@ TEST(Carve, CanBeInterrupted) {
 }
 
 TEST(Carve, RealFramesMatchTraversal) {
-  const char* shared = std::getenv("VDBC_SHARED");
-  const std::string folder =
-      (shared ? std::string(shared) : VDBC_SOURCE_DIR "/../shared") + "/data/rgbd_redkitchen";
-  if (!std::filesystem::exists(folder)) GTEST_SKIP() << folder << " is absent";
+  const std::string folder = sharedFile("data/rgbd_redkitchen");
+  if (folder.empty()) GTEST_SKIP() << "no kitchen";
   ReadViewsSettings reading;
   reading.frames = {0, 9};
-  reading.max_side = 320;
   std::vector<OwnedView> views;
   for (const View& v : readViews(folder, reading)) views.push_back({v.camera, v.depth});
   for (const float voxel_m : {0.1f, 0.04f}) {
     VoxelFrame frame;
     frame.voxel_m = voxel_m;
     const int n = int(4 / voxel_m);
-    const Vector3d middle = views[0].camera.unproject(160, 120, 2) / double(voxel_m);
+    const Vector3d middle = views[0].camera.unproject(320, 240, 2) / double(voxel_m);
     const Coord centre(int(middle.x()), int(middle.y()), int(middle.z()));
     frame.bounds = CoordBBox(centre.offsetBy(-n), centre.offsetBy(n));
     expectSameAsTraversal(frame, views, {}, joinText("voxel ", voxel_m));

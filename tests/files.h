@@ -28,6 +28,13 @@ inline void writeBytes(const std::string& path, const std::string& bytes) {
   std::ofstream(path, std::ios::binary) << bytes;
 }
 
+/// Data that is too large for the repository, or "" where it is not on this machine.
+inline std::string sharedFile(const std::string& name) {
+  const char* shared = std::getenv("VDBC_SHARED");
+  const std::string path = std::string(shared ? shared : VDBC_SOURCE_DIR "/../shared") + "/" + name;
+  return std::filesystem::exists(path) ? path : "";
+}
+
 /// Standard output and error of a command, or nothing where it failed.
 inline std::string outputOf(const std::string& command) {
   std::string text;

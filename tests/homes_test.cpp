@@ -353,11 +353,11 @@ TEST_F(Homes, HostileFilesAreRefusedInOneLine) {
   const auto refused = [&](const std::string& part, const std::string& xml) {
     expectError(part, [&] { read(xml); });
   };
-  expectError("expected a .sh3d file", [&] { readHome(assets(), "/nonexistent/a.sh3d"); });
+  expectError("No such file", [&] { readHome(assets(), "/nonexistent/a.sh3d"); });
   std::ofstream(path_) << "not a zip";
-  expectError("expected a .sh3d file", [&] { readHome(assets(), path_.string()); });
+  expectError("expected a zip file", [&] { readHome(assets(), path_.string()); });
   expectError("only the Java object Home", [&] { read("x", "Home"); });
-  expectError("expected an entry Home.xml", [&] { read("x", "Other"); });
+  expectError("no entry Home.xml", [&] { read("x", "Other"); });
   refused("expected XML", "");
   refused("expected XML", "<home><wall></home>");
   refused("expected an element home", "<house/>");

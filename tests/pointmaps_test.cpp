@@ -323,7 +323,7 @@ TEST(Pointmap, ConfidenceBelowHalfOfItsMedianIsNoDepth) {
   expectScene(readViews(folder / "a.npz"), scene, 1e-5);
 }
 
-TEST(Pointmap, FramesSizesAndCamerasAlone) {
+TEST(Pointmap, FramesAndCamerasAlone) {
   const TemporaryFolder folder;
   const Scene scene = ballInBox();
   writeNpz(arraysOf(scene, 1).list(), folder / "a.npz");
@@ -335,9 +335,6 @@ TEST(Pointmap, FramesSizesAndCamerasAlone) {
   EXPECT_NEAR(two[1].depth[5], scene.depth[0][5], 1e-5);
   settings.frames = {3};
   EXPECT_SAYS(errorOf(folder / "a.npz", settings), "out of range");
-  settings.frames = {};
-  settings.max_side = kWidth / 2;
-  EXPECT_EQ(readViews(folder / "a.npz", settings)[1].camera.height, kHeight / 2);
 
   Arrays bare = arraysOf(scene, 1);
   bare.members.erase("images");

@@ -1,4 +1,4 @@
-// The ray caster against closed forms, and carve() against the ray caster (spec A1).
+// The ray caster against closed forms, and carve() against the ray caster.
 #include "splat/rays.h"
 
 #include <gtest/gtest.h>
@@ -154,87 +154,10 @@ TEST(RayTarget, VoxelsAreTheirBoxes) {
   EXPECT_GT(inside, 50);
 }
 
-Gaussians oneGaussian(const Vector3f& mean, const Vector3f& sigma, const Eigen::Vector4f& rotation,
-                      float opacity) {
-  Gaussians g;
-  g.resize(1, 0);
-  g.mean[0] = mean;
-  g.log_scale[0] = sigma.array().log();
-  g.rotation[0] = rotation;
-  g.opacity_logit[0] = std::log(opacity / (1 - opacity));
-  return g;
-}
-
-TEST(RayTarget, RoundGaussianIsASphere) {
-  const Vector3d centre(.3, -.4, 2);
-  const double radius = .2 * 1.5;
-  const RayTarget target = RayTarget::fromGaussians(
-      oneGaussian(centre.cast<float>(), Vector3f::Constant(.2f), {1, 0, 0, 0}, .9f), 1.5f, .3f);
-  Random random(4);
-  int hits = 0;
-  for (int i = 0; i < 2000; ++i) {
-    const Vector3f o = random.inBox(1).cast<float>();
-    const Vector3f aim = (centre + random.inBox(.35)).cast<float>();
-    const Vector3f d = (aim - o).normalized();
-    const float t = target.trace({o}, {d})[0];
-    // Perpendicular distance and Pythagoras.
-    const Vector3d to = centre - o.cast<double>();
-    const double along = to.dot(d.cast<double>()), h2 = to.squaredNorm() - along * along;
-    if (std::abs(std::sqrt(h2) - radius) < 1e-3) continue;  // grazing
-    if (h2 > radius * radius) {
-      EXPECT_FALSE(std::isfinite(t));
-    } else {
-      EXPECT_NEAR(t, along - std::sqrt(radius * radius - h2), 1e-4);
-      ++hits;
-    }
-  }
-  EXPECT_GT(hits, 500);
-  EXPECT_EQ(target.trace({centre.cast<float>()}, {Vector3f::UnitX()})[0], 0);  // solid
-}
-
-TEST(RayTarget, HitsOfAnEllipsoidLieOnItsSurfaceAndNoPointBeforeIsInside) {
-  const Vector3f sigma(.05f, .3f, .12f), mean(-.2f, .1f, .4f);
-  Eigen::Quaternionf q(Eigen::AngleAxisf(1.1f, Vector3f(1, -2, .5f).normalized()));
-  // The stored quaternion need not be normalised.
-  const RayTarget target = RayTarget::fromGaussians(
-      oneGaussian(mean, sigma, Eigen::Vector4f(q.w(), q.x(), q.y(), q.z()) * 3, .9f), 2.f, .3f);
-  const Eigen::Matrix3d covariance = q.toRotationMatrix().cast<double>() *
-                                     sigma.cast<double>().cwiseAbs2().asDiagonal() *
-                                     q.toRotationMatrix().transpose().cast<double>();
-  const Eigen::Matrix3d precision = covariance.inverse();
-  const auto level = [&](const Vector3d& p) {  // Mahalanobis distance
-    const Vector3d d = p - mean.cast<double>();
-    return std::sqrt(d.dot(precision * d));
-  };
-  Random random(5);
-  int hits = 0;
-  for (int i = 0; i < 1500; ++i) {
-    const Vector3d o = random.direction() * 2;
-    const Vector3d d = (mean.cast<double>() + random.inBox(.4) - o).normalized();
-    const float t = target.trace({o.cast<float>()}, {d.cast<float>()})[0];
-    double nearest = kInfinity;  // smallest Mahalanobis distance along the ray, or up to the hit
-    for (int k = 0; k <= 800; ++k)
-      nearest = std::min(nearest, level(o + d * (std::isfinite(t) ? t - 1e-4 : 4.) * k / 800));
-    EXPECT_GT(nearest, 1.99) << i;
-    if (!std::isfinite(t)) continue;
-    EXPECT_NEAR(level(o + d * t), 2, 2e-3);
-    ++hits;
-  }
-  EXPECT_GT(hits, 300);
-}
-
-TEST(RayTarget, FaintGaussiansAreNotThere) {
-  const Gaussians faint = oneGaussian({0, 0, 1}, Vector3f::Constant(.2f), {1, 0, 0, 0}, .29f);
-  const std::vector<Vector3f> o = {Vector3f::Zero()}, d = {Vector3f::UnitZ()};
-  EXPECT_FALSE(std::isfinite(RayTarget::fromGaussians(faint, 1.5f, .3f).trace(o, d)[0]));
-  EXPECT_NEAR(RayTarget::fromGaussians(faint, 1.5f, .28f).trace(o, d)[0], .7f, 1e-5);
-}
-
 TEST(RayTarget, EmptyTargetsAreMissedAndBadMeshesThrow) {
   const std::vector<Vector3f> o = {Vector3f::Zero()}, d = {Vector3f::UnitZ()};
   EXPECT_FALSE(std::isfinite(RayTarget::fromMesh({}).trace(o, d)[0]));
   EXPECT_FALSE(std::isfinite(RayTarget::fromVoxels({}, {}).trace(o, d)[0]));
-  EXPECT_FALSE(std::isfinite(RayTarget::fromGaussians({}).trace(o, d)[0]));
   TriangleMesh bad;
   bad.vertices.resize(3, Vector3f::Zero());
   bad.triangles.emplace_back(0, 1, 3);
@@ -345,7 +268,7 @@ TEST(LeakRate, ToleranceDecidesHowFarBehindCounts) {
   EXPECT_EQ(leakRate(b, a, o, 2000, .001f, 1), 0);  // in front is no leak
 }
 
-// --- spec A1: carve() against Embree
+// --- carve() against Embree
 // --------------------------------------------------------------
 
 using VoxelSet = std::set<std::tuple<int, int, int>>;

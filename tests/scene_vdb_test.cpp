@@ -23,6 +23,7 @@
 #include "tests/vdb_files.h"
 #include "vdb/grid_instances.h"
 #include "vdb/mask_vdb.h"
+#include "vdb/vdb_file.h"
 
 namespace vdbc {
 namespace {

@@ -347,11 +347,10 @@ TEST_F(VolumeViews, FramesAreChosenAmongThem) {
   const std::vector<View> all = readViews(path);
   ReadViewsSettings settings;
   settings.frames = {7, 2};
-  settings.max_side = 56;
   const std::vector<View> two = readViews(path, settings);
   ASSERT_EQ(two.size(), 2u);
   EXPECT_EQ(two[0].camera.world_from_camera.matrix(), all[7].camera.world_from_camera.matrix());
-  EXPECT_EQ(two[1].camera.width, 56);
+  EXPECT_EQ(two[1].depth, all[2].depth);
   settings.cameras_only = true;
   const std::vector<View> cameras = readViews(path, settings);
   EXPECT_EQ(cameras[1].camera.world_from_camera.matrix(), all[2].camera.world_from_camera.matrix());
@@ -430,14 +429,6 @@ TEST_F(VolumeViews, UnsuitableFilesThrow) {
 
 // --- files by others ---
 
-/// A file of the team's collection, or nothing where it is not there.
-std::string sharedVolume(const std::string& name) {
-  const char* shared = std::getenv("VDBC_SHARED");
-  const std::string folder = shared ? shared : VDBC_SOURCE_DIR "/../shared",
-                    path = folder + "/data/vdb/" + name;
-  return std::filesystem::exists(path) ? path : std::string();
-}
-
 /// All measured points of a sphere around the origin have the same distance from it.
 void expectSphere(const std::string& path, double radius, double tolerance) {
   EXPECT_EQ(conventionalUp(path), Vector3d::UnitY());  // Houdini's
@@ -455,22 +446,22 @@ void expectSphere(const std::string& path, double radius, double tolerance) {
 }
 
 TEST_F(VolumeViews, HoudiniSpheresAreRound) {
-  const std::string level_set = sharedVolume("sphere_levelset.vdb"),
-                    fog = sharedVolume("houdini_sphere_fog.vdb");
+  const std::string level_set = sharedFile("data/vdb/sphere_levelset.vdb"),
+                    fog = sharedFile("data/vdb/houdini_sphere_fog.vdb");
   if (level_set.empty() || fog.empty()) GTEST_SKIP() << "no shared volumes";
   expectSphere(level_set, 3, .02);
   expectSphere(fog, .9, .1);
 }
 
 TEST_F(VolumeViews, OtherVolumesThrow) {
-  if (sharedVolume("points.vdb").empty()) GTEST_SKIP() << "no shared volumes";
-  expectThrows(sharedVolume("points.vdb"), "ptdataidx");
-  expectThrows(sharedVolume("blender_smoke_000001_empty.vdb"), "empty");
-  expectThrows(sharedVolume("blender_smoke_000002.vdb"), "cubic");
+  if (sharedFile("data/vdb/points.vdb").empty()) GTEST_SKIP() << "no shared volumes";
+  expectThrows(sharedFile("data/vdb/points.vdb"), "ptdataidx");
+  expectThrows(sharedFile("data/vdb/blender_smoke_000001_empty.vdb"), "empty");
+  expectThrows(sharedFile("data/vdb/blender_smoke_000002.vdb"), "cubic");
 }
 
 TEST_F(VolumeViews, SmokeIsLookedAtFromBesideIt) {
-  const std::string path = sharedVolume("smoke.vdb");
+  const std::string path = sharedFile("data/vdb/smoke.vdb");
   if (path.empty()) GTEST_SKIP() << "no shared volumes";
   EXPECT_EQ(readViews(path).size(), 12u);
 }

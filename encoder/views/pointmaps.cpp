@@ -235,7 +235,7 @@ std::vector<View> readPointmaps(const std::string& path, const ReadViewsSettings
       const bool sure = !g.confidence || float(g.confidence->at(s * g.pixels() + i)) >= least;
       view.depth[i] = sure ? view.depth[i] * scale : 0.f;
     }
-    finishView(&view, settings, path);
+    requireDepth(view, path);
     return view;
   });
 }

@@ -8,11 +8,8 @@
 namespace vdbc {
 
 struct ReadViewsSettings {
-  std::vector<int> frames;  // indices into the folder's frames; empty = all
-  int max_side = 0;  // shrink so that the longer side is at most this; 0 = as stored. Colour is
-                     // area-averaged, depth takes the nearest sample
-  bool cameras_only =
-      false;  // colour and depth stay empty and need not be there; max_side is not heeded
+  std::vector<int> frames;     // indices into the folder's frames; empty = all
+  bool cameras_only = false;   // colour and depth stay empty and need not be there
   double metres_per_unit = 0;  // of an .npz; 0 = from the file (PointmapScale), if it tells
 };
 

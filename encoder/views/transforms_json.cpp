@@ -178,6 +178,55 @@ std::optional<std::pair<int, int>> statedSize(const Keys& keys) {
   return std::pair(int(*w), int(*h));
 }
 
+/// The frame's pose, camera to the world before nerfstudio's export.
+Eigen::Isometry3d jsonPose(const Keys& keys, const Applied& applied) {
+  const auto matrix = keys.frame.find("transform_matrix");
+  require(matrix != keys.frame.end(), kReadViews, ": ", keys.where, ": no transform_matrix");
+  Eigen::Isometry3d pose =
+      rigid(jsonMatrix(*matrix, keys.where, "transform_matrix"), keys.where, "transform_matrix");
+  pose.translation() /= applied.scale;
+  pose.linear().rightCols<2>() *= -1;  // OpenGL (y up, looks along -z) to OpenCV axes
+  return applied.file_from_source.inverse() * pose;
+}
+
+/// Throws Error unless a picture that belongs to another has its size.
+void requireSameSize(const std::string& file, const char* what, int width, int height,
+                     const Camera& camera, const std::string& image_file) {
+  require(width == camera.width && height == camera.height, kReadViews, ": ", file, ": ", what,
+          " and colour differ in size (expected ", camera.width, " x ", camera.height, " as ",
+          image_file, ", found ", width, " x ", height, ")");
+}
+
+/// Planar depth in metres [height * width], 0 where there is none or the frame's mask is black.
+std::vector<float> jsonDepth(const Keys& keys, const fs::path& folder, const Camera& camera,
+                             const std::string& image_file) {
+  const auto path = keys.text("depth_file_path");
+  require(path && !path->empty(), kReadViews, ": ", keys.where, " (",
+          keys.text("file_path").value_or(""), "): no depth (expected depth_file_path)");
+  const std::string depth_file = imagePath(folder, *path);
+  int width = 0, height = 0;
+  const std::vector<uint16_t> stored = readPng16(depth_file, &width, &height);
+  requireSameSize(depth_file, "depth", width, height, camera, image_file);
+  const double unit = keys.number("depth_unit_scale_factor").value_or(1e-3);
+  require(unit > 0, kReadViews, ": ", keys.where,
+          ": depth_unit_scale_factor: expected more than 0, found ", unit);
+  std::vector<float> depth(stored.size());
+  for (size_t i = 0; i < stored.size(); ++i)
+    depth[i] = stored[i] == kNoDepth16 ? 0.f : float(stored[i] * unit);
+
+  const auto mask_path = keys.text("mask_path");
+  if (!mask_path || mask_path->empty()) return depth;
+  const std::string mask_file = imagePath(folder, *mask_path);
+  const Image mask = readImage(mask_file);
+  requireSameSize(mask_file, "mask", mask.width, mask.height, camera, image_file);
+  const size_t channels = size_t(mask.channels);
+  for (size_t i = 0; i < depth.size(); ++i) {
+    const float* m = mask.data.data() + i * channels;
+    if (std::all_of(m, m + channels, [](float v) { return v == 0; })) depth[i] = 0;
+  }
+  return depth;
+}
+
 View readJsonFrame(const Json& json, size_t index, const Applied& applied, const std::string& path,
                    const ReadViewsSettings& settings) {
   const fs::path folder = fs::path(path).parent_path();
@@ -191,58 +240,38 @@ View readJsonFrame(const Json& json, size_t index, const Applied& applied, const
 
   View view;
   view.name = *file_path;
-  const std::string image_path = imagePath(folder, *file_path);
+  const std::string image_file = imagePath(folder, *file_path);
   const auto size = settings.cameras_only ? statedSize(keys) : std::nullopt;
-  if (!size) view.colour = threeChannels(readImage(image_path));
-  const int w = size ? size->first : view.colour.width,
-            h = size ? size->second : view.colour.height;
-  view.camera = jsonCamera(keys, w, h, image_path);
-
-  const auto matrix = frame.find("transform_matrix");
-  require(matrix != frame.end(), kReadViews, ": ", keys.where, ": no transform_matrix");
-  Eigen::Isometry3d pose =
-      rigid(jsonMatrix(*matrix, keys.where, "transform_matrix"), keys.where, "transform_matrix");
-  pose.translation() /= applied.scale;
-  // OpenGL (y up, looks along -z) to OpenCV axes; then back to the frame before nerfstudio's
-  // export.
-  pose.linear().rightCols<2>() *= -1;
-  view.camera.world_from_camera = applied.file_from_source.inverse() * pose;
+  if (!size) view.colour = threeChannels(readImage(image_file));
+  view.camera = jsonCamera(keys, size ? size->first : view.colour.width,
+                           size ? size->second : view.colour.height, image_file);
+  view.camera.world_from_camera = jsonPose(keys, applied);
   if (settings.cameras_only) {
     view.colour = {};
     return view;
   }
-
-  const auto depth_path = keys.text("depth_file_path");
-  require(depth_path && !depth_path->empty(), kReadViews, ": ", keys.where, " (", *file_path,
-          "): no depth (expected depth_file_path)");
-  const std::string depth_file = imagePath(folder, *depth_path);
-  int depth_w = 0, depth_h = 0;
-  const std::vector<uint16_t> stored = readPng16(depth_file, &depth_w, &depth_h);
-  require(depth_w == w && depth_h == h, kReadViews, ": ", depth_file,
-          ": depth and colour differ in size (expected ", w, " x ", h, " as ", image_path,
-          ", found ", depth_w, " x ", depth_h, ")");
-  const double unit = keys.number("depth_unit_scale_factor").value_or(1e-3);
-  require(unit > 0, kReadViews, ": ", keys.where,
-          ": depth_unit_scale_factor: expected more than 0, found ", unit);
-  view.depth.resize(stored.size());
-  for (size_t i = 0; i < stored.size(); ++i) {
-    view.depth[i] = stored[i] == kNoDepth16 ? 0.f : float(stored[i] * unit);
-  }
-  if (const auto mask_path = keys.text("mask_path"); mask_path && !mask_path->empty()) {
-    const std::string mask_file = imagePath(folder, *mask_path);
-    const Image mask = readImage(mask_file);
-    require(mask.width == w && mask.height == h, kReadViews, ": ", mask_file,
-            ": mask and colour differ in size (expected ", w, " x ", h, " as ", image_path,
-            ", found ", mask.width, " x ", mask.height, ")");
-    const size_t channels = size_t(mask.channels);
-    for (size_t i = 0; i < view.depth.size(); ++i) {
-      const float* m = mask.data.data() + i * channels;
-      if (std::all_of(m, m + channels, [](float v) { return v == 0; })) view.depth[i] = 0;
-    }
-  }
-  finishView(&view, settings, path);
+  view.depth = jsonDepth(keys, folder, view.camera, image_file);
+  requireDepth(view, path);
   return view;
 }
+
+}  // namespace
+std::vector<View> readTransforms(const std::string& path, const ReadViewsSettings& settings) {
+  const Json json = parseTransforms(path);
+  const auto frames = json.find("frames");
+  require(frames != json.end() && frames->is_array(), kReadViews, ": ", path,
+          ": expected an array `frames`");
+  const Applied applied = appliedTransform(json, path);
+  return readAll(selectFrames(settings, frames->size(), path),
+                 [&](size_t i) { return readJsonFrame(json, i, applied, path, settings); });
+}
+
+Eigen::Vector3d transformsUp(const std::string& path) {
+  const Applied applied = appliedTransform(parseTransforms(path), path);
+  return applied.file_from_source.linear().transpose() * Eigen::Vector3d::UnitZ();
+}
+
+namespace {
 
 void requireWritable(const char* operation, const std::string& path, const View& view) {
   const Camera& c = view.camera;
@@ -269,20 +298,6 @@ Json poseJson(const Camera& camera) {
 }
 
 }  // namespace
-std::vector<View> readTransforms(const std::string& path, const ReadViewsSettings& settings) {
-  const Json json = parseTransforms(path);
-  const auto frames = json.find("frames");
-  require(frames != json.end() && frames->is_array(), kReadViews, ": ", path,
-          ": expected an array `frames`");
-  const Applied applied = appliedTransform(json, path);
-  return readAll(selectFrames(settings, frames->size(), path),
-                 [&](size_t i) { return readJsonFrame(json, i, applied, path, settings); });
-}
-
-Eigen::Vector3d transformsUp(const std::string& path) {
-  const Applied applied = appliedTransform(parseTransforms(path), path);
-  return applied.file_from_source.linear().transpose() * Eigen::Vector3d::UnitZ();
-}
 
 void writeViews(const std::vector<View>& views, const std::string& folder) {
   constexpr const char* kOperation = "writeViews";

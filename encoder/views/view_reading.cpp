@@ -52,30 +52,10 @@ std::vector<float> depthFromPositions(const Image& positions, const Camera& came
   return depth;
 }
 
-void finishView(View* view, const ReadViewsSettings& settings, const std::string& path) {
+void requireDepth(const View& view, const std::string& path) {
   const bool measured =
-      std::any_of(view->depth.begin(), view->depth.end(), [](float z) { return z > 0; });
-  require(measured, kReadViews, ": ", path, ": depth of ", view->name, " has no valid pixel");
-  const int w = view->camera.width, h = view->camera.height, longer = std::max(w, h);
-  if (settings.max_side <= 0 || longer <= settings.max_side) return;
-  const double scale = double(settings.max_side) / longer;
-  const int new_w = std::max(1, int(std::lround(w * scale)));
-  const int new_h = std::max(1, int(std::lround(h * scale)));
-  std::vector<float> depth(size_t(new_w) * size_t(new_h));
-  for (int y = 0; y < new_h; ++y) {
-    const int from_y = std::min(h - 1, int((y + 0.5) * h / new_h));
-    for (int x = 0; x < new_w; ++x) {
-      const int from_x = std::min(w - 1, int((x + 0.5) * w / new_w));
-      depth[size_t(y) * size_t(new_w) + size_t(x)] =
-          view->depth[size_t(from_y) * size_t(w) + size_t(from_x)];
-    }
-  }
-  require(std::any_of(depth.begin(), depth.end(), [](float z) { return z > 0; }), kReadViews, ": ",
-          path, ": depth of ", view->name, " has no valid pixel once shrunk to ", new_w, " x ",
-          new_h);
-  view->depth = std::move(depth);
-  view->colour = resizeImage(view->colour, new_w, new_h);
-  view->camera = resized(view->camera, new_w, new_h);
+      std::any_of(view.depth.begin(), view.depth.end(), [](float z) { return z > 0; });
+  require(measured, kReadViews, ": ", path, ": depth of ", view.name, " has no valid pixel");
 }
 
 std::vector<size_t> selectFrames(const ReadViewsSettings& settings, size_t count,

@@ -23,8 +23,8 @@ Eigen::Isometry3d rigid(const Eigen::Matrix4d& m, const std::string& path, const
 /// is none.
 std::vector<float> depthFromPositions(const Image& positions, const Camera& camera);
 
-/// Applies settings.max_side and requires what every View promises.
-void finishView(View* view, const ReadViewsSettings& settings, const std::string& path);
+/// Throws Error unless some pixel has depth.
+void requireDepth(const View& view, const std::string& path);
 
 /// Which of `count` frames to read, checked.
 std::vector<size_t> selectFrames(const ReadViewsSettings& settings, size_t count,

@@ -536,7 +536,7 @@ std::vector<View> readVolumeViews(const std::string& path, const ReadViewsSettin
     view.camera = cameras[i];
     if (settings.cameras_only) return view;
     lookAround(volume, &view);
-    finishView(&view, settings, path);
+    requireDepth(view, path);
     return view;
   });
 }

@@ -1,14 +1,11 @@
 #include "examples/rooms/assets.h"
 
-#include <jpeglib.h>
-#include <png.h>
 #include <tiny_obj_loader.h>
 
 #include <algorithm>
 #include <array>
 #include <charconv>
 #include <cmath>
-#include <csetjmp>
 #include <cstring>
 #include <filesystem>
 #include <fstream>
@@ -22,7 +19,7 @@
 #include <unordered_map>
 
 #include "encoder/views/zip_file.h"
-#include "splat/image.h"
+#include "splat/image_files.h"
 #include "vdb/error.h"
 #include "vdb/file_io.h"
 
@@ -38,7 +35,6 @@ using Eigen::Vector3f;
 using Properties = std::map<std::string, std::string>;
 
 constexpr uint64_t kMaxEntryBytes = uint64_t(256) << 20;
-constexpr int kMaxImageSide = 8192;
 constexpr int kMaxTextureSide = 1024;  // larger ones are halved: no picture of a room shows more
 constexpr size_t kMaxTriangles = 400000;
 constexpr size_t kMaxReadTriangles = 4000000;
@@ -367,90 +363,7 @@ Table readTable(const std::string& path) {
   return table;
 }
 
-// ---- Images, from memory
-
-/// libjpeg reports errors by longjmp: nothing with a destructor between setjmp and longjmp.
-struct JpegErrors {
-  jpeg_error_mgr base;  // first: libjpeg hands back a pointer to it
-  std::jmp_buf jump;
-  char message[JMSG_LENGTH_MAX];
-};
-[[noreturn]] void onJpegError(j_common_ptr jpeg) {
-  auto* errors = reinterpret_cast<JpegErrors*>(jpeg->err);
-  jpeg->err->format_message(jpeg, errors->message);
-  std::longjmp(errors->jump, 1);
-}
-void onJpegMessage(j_common_ptr, int) {}
-bool startJpeg(jpeg_decompress_struct* jpeg, JpegErrors* errors, const std::string& bytes) {
-  if (setjmp(errors->jump)) return false;
-  jpeg_create_decompress(jpeg);
-  jpeg_mem_src(jpeg, reinterpret_cast<const unsigned char*>(bytes.data()),
-               static_cast<unsigned long>(bytes.size()));
-  jpeg_read_header(jpeg, TRUE);
-  return true;
-}
-bool finishJpeg(jpeg_decompress_struct* jpeg, JpegErrors* errors, uint8_t* rgb) {
-  if (setjmp(errors->jump)) return false;
-  jpeg->out_color_space = JCS_RGB;
-  jpeg_start_decompress(jpeg);
-  while (jpeg->output_scanline < jpeg->output_height) {
-    JSAMPROW row = rgb + size_t(jpeg->output_scanline) * jpeg->output_width * 3;
-    jpeg_read_scanlines(jpeg, &row, 1);
-  }
-  jpeg_finish_decompress(jpeg);
-  return true;
-}
-
-/// Refuses sizes that no picture of `bytes` bytes has: at best 1 bit a block of a JPEG, 1040-fold
-/// deflate of a PNG of 1 bit a pixel.
-void requireImageSize(uint64_t width, uint64_t height, size_t bytes, const std::string& where) {
-  require(width > 0 && height > 0 && width <= kMaxImageSide && height <= kMaxImageSide,
-          "readTexture: ", where, ": expected 1 to ", kMaxImageSide, " pixels a side, found ",
-          width, " x ", height);
-  require(width * height / (8 * 1040) <= bytes, "readTexture: ", where, ": ", bytes,
-          " bytes are too few for ", width, " x ", height, " pixels");
-}
-
-Texture readJpeg(const std::string& bytes, const std::string& where) {
-  struct Handles {
-    jpeg_decompress_struct jpeg{};
-    JpegErrors errors{};
-    ~Handles() { jpeg_destroy_decompress(&jpeg); }
-  } h;
-  h.jpeg.err = jpeg_std_error(&h.errors.base);
-  h.errors.base.error_exit = onJpegError;
-  h.errors.base.emit_message = onJpegMessage;
-  require(startJpeg(&h.jpeg, &h.errors, bytes), "readTexture: ", where,
-          ": corrupt JPEG: ", h.errors.message);
-  requireImageSize(h.jpeg.image_width, h.jpeg.image_height, bytes.size(), where);
-  Texture texture;
-  texture.width = int(h.jpeg.image_width), texture.height = int(h.jpeg.image_height);
-  const size_t pixels = size_t(texture.width) * size_t(texture.height);
-  std::vector<uint8_t> rgb(pixels * 3);
-  require(finishJpeg(&h.jpeg, &h.errors, rgb.data()), "readTexture: ", where,
-          ": corrupt JPEG: ", h.errors.message);
-  texture.rgba.resize(pixels * 4, 255);
-  for (size_t i = 0; i < pixels; ++i) std::copy_n(&rgb[i * 3], 3, &texture.rgba[i * 4]);
-  return texture;
-}
-
-Texture readPng(const std::string& bytes, const std::string& where) {
-  struct Handle {
-    png_image image{};
-    ~Handle() { png_image_free(&image); }
-  } h;
-  h.image.version = PNG_IMAGE_VERSION;
-  require(png_image_begin_read_from_memory(&h.image, bytes.data(), bytes.size()) != 0,
-          "readTexture: ", where, ": corrupt PNG: ", h.image.message);
-  requireImageSize(h.image.width, h.image.height, bytes.size(), where);
-  h.image.format = PNG_FORMAT_RGBA;
-  Texture texture;
-  texture.width = int(h.image.width), texture.height = int(h.image.height);
-  texture.rgba.resize(PNG_IMAGE_SIZE(h.image));
-  require(png_image_finish_read(&h.image, nullptr, texture.rgba.data(), 0, nullptr) != 0,
-          "readTexture: ", where, ": corrupt PNG: ", h.image.message);
-  return texture;
-}
+// ---- Images
 
 /// Half the size, by means of 2 x 2 pixels.
 Texture halved(const Texture& t) {
@@ -473,10 +386,9 @@ Texture halved(const Texture& t) {
 
 Texture readTexture(const CatalogueZip& zip, const std::string& entry) {
   const std::string bytes = zip.read(entry), where = zip.path() + ": " + entry;
-  const bool is_png = bytes.compare(0, 4, "\x89PNG") == 0,
-             is_jpeg = bytes.compare(0, 2, "\xFF\xD8") == 0;
-  require(is_png || is_jpeg, "readTexture: ", where, ": expected a PNG or JPEG, found neither");
-  Texture texture = is_png ? readPng(bytes, where) : readJpeg(bytes, where);
+  Texture texture;
+  texture.rgba =
+      decodeRgba("readTexture", where, bytes.data(), bytes.size(), &texture.width, &texture.height);
   while (std::max(texture.width, texture.height) > kMaxTextureSide) texture = halved(texture);
   for (size_t i = 3; i < texture.rgba.size(); i += 4) texture.has_alpha |= texture.rgba[i] < 255;
   return texture;

@@ -2,8 +2,6 @@
 // file (a zip). Its plan has y down and angles clockwise, in centimetres; ours is (x, -y) in
 // metres. What the file says is read first, then walls, floors, ceilings and furniture are built
 // from it.
-#include <zip.h>
-
 #include <algorithm>
 #include <array>
 #include <cctype>
@@ -16,6 +14,7 @@
 #include <pugixml.hpp>
 #include <set>
 
+#include "encoder/views/zip_file.h"
 #include "examples/rooms/floor_plan.h"
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
@@ -31,8 +30,8 @@ using Eigen::Vector3f;
 
 constexpr double kPi = 3.14159265358979323846;
 constexpr char kExamples[] = "com/eteks/sweethome3d/io/resources/examples/";
-constexpr zip_uint64_t kMostHomeBytes = 64 << 20;  // the largest example has 0.1 MB
-constexpr int kMostGroups = 16;                    // of groups in groups
+constexpr uint64_t kMostHomeBytes = 64 << 20;  // the largest example has 0.1 MB
+constexpr int kMostGroups = 16;                // of groups in groups
 
 // --- what the file says: metres, world x and y, angles counter-clockwise
 // ---------------------------
@@ -1336,31 +1335,11 @@ std::vector<std::string> exampleHomes(const AssetLibrary& assets) {
 
 /// Home.xml of a .sh3d file.
 std::string homeXml(const std::string& path) {
-  int code = 0;
-  zip_t* opened = zip_open(path.c_str(), ZIP_RDONLY, &code);
-  if (opened == nullptr) {
-    zip_error_t error;
-    zip_error_init_with_code(&error, code);
-    const std::string found = zip_error_strerror(&error);
-    zip_error_fini(&error);
-    throw Error(joinText("readHome: ", path, ": expected a .sh3d file (a zip), found ", found));
-  }
-  const std::unique_ptr<zip_t, void (*)(zip_t*)> archive(opened, zip_discard);
-  zip_stat_t about;
-  const bool has_xml = zip_stat(opened, "Home.xml", 0, &about) == 0 && about.valid & ZIP_STAT_SIZE;
-  require(has_xml || zip_name_locate(opened, "Home", 0) < 0, "readHome: ", path,
+  const ZipFile zip("readHome", path);
+  require(zip.has("Home.xml") || !zip.has("Home"), "readHome: ", path,
           ": expected Home.xml, found only the Java object Home; save it with Sweet Home 3D 5.3 or "
           "newer");
-  require(has_xml, "readHome: ", path, ": expected an entry Home.xml, found none");
-  require(about.size <= kMostHomeBytes, "readHome: ", path, ": Home.xml: expected at most ",
-          kMostHomeBytes, " bytes, found ", about.size);
-  std::string xml(size_t(about.size), 0);
-  const std::unique_ptr<zip_file_t, int (*)(zip_file_t*)> entry(zip_fopen(opened, "Home.xml", 0),
-                                                                zip_fclose);
-  const zip_int64_t got = entry ? zip_fread(entry.get(), xml.data(), xml.size()) : -1;
-  require(got == zip_int64_t(xml.size()), "readHome: ", path, ": Home.xml: expected ", xml.size(),
-          " bytes, found ", got < 0 ? "a broken entry" : std::to_string(got));
-  return xml;
+  return zip.read("Home.xml", kMostHomeBytes);
 }
 
 }  // namespace

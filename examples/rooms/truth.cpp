@@ -13,6 +13,7 @@
 #include "vdb/file_io.h"
 #include "vdb/fit_volume.h"
 #include "vdb/grid_instances.h"
+#include "vdb/vdb_file.h"
 
 namespace vdbc {
 
