@@ -71,8 +71,6 @@ Tensor sinusoidalCode(const Tensor& positions) {
 
 Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame,
                            const PositionConfig& config) {
-  constexpr float kExtent =
-      12.8f;  // metres; larger places go beyond +-.5 and the code still differs
   const Coord lo = frame.bounds.min(), hi = frame.bounds.max();
   const Tensor origin = torch::tensor({float(lo.x() + hi.x() + 1) / 2 * frame.voxel_m,
                                        float(lo.y() + hi.y() + 1) / 2 * frame.voxel_m,
