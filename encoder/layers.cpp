@@ -112,7 +112,7 @@ Tensor splitHeads(const Tensor& x, int heads) {  // [N, C] -> [H, N, C / H]
 Attention::Context Attention::contextOf(const Tensor& rows, const Rotary* pos) {
   const auto through = [&](Linear& layer) {
     return inRowBlocks(rows.size(0), [&](int64_t begin, int64_t end) {
-      return layer->forward(rowsOf(rows, begin, end));
+      return layer->forward(rowRange(rows, begin, end));
     });
   };
   const Tensor keys = splitHeads(through(key), heads);
@@ -144,8 +144,8 @@ Tensor SelfBlock::forward(const Tensor& x, const Rotary* pos) {
   const Attention::Context context = attention->contextOf(normed, pos);
   return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
     const Rotary p = pos ? pos->slice(begin, end) : Rotary();
-    const Tensor y = rowsOf(x, begin, end) +
-                     attention->forward(rowsOf(normed, begin, end), pos ? &p : nullptr, context);
+    const Tensor y = rowRange(x, begin, end) +
+                     attention->forward(rowRange(normed, begin, end), pos ? &p : nullptr, context);
     return y + mlp->forward(norm2->forward(y));
   });
 }

@@ -33,7 +33,7 @@ struct Rotary {
     return {cos.index_select(0, rows), sin.index_select(0, rows)};
   }
   Rotary slice(int64_t begin, int64_t end) const {
-    return {rowsOf(cos, begin, end), rowsOf(sin, begin, end)};
+    return {rowRange(cos, begin, end), rowRange(sin, begin, end)};
   }
 };
 Rotary rotary(const Tensor& coords, int head_dim, const PositionConfig& config);
@@ -93,8 +93,8 @@ struct Attention : torch::nn::Module {
     const Context context = contextOf(rows, nullptr);
     const Tensor given = guide(context.values);
     return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
-      return output->forward(alpha * attend(rowsOf(x, begin, end), nullptr, context) +
-                             (1 - alpha) * rowsOf(given, begin, end));
+      return output->forward(alpha * attend(rowRange(x, begin, end), nullptr, context) +
+                             (1 - alpha) * rowRange(given, begin, end));
     });
   }
 
@@ -107,7 +107,7 @@ struct Mlp : torch::nn::Module {
   Mlp(int in, int hidden, int out);
   Tensor forward(const Tensor& x) {
     return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
-      return second->forward(torch::gelu(first->forward(rowsOf(x, begin, end))));
+      return second->forward(torch::gelu(first->forward(rowRange(x, begin, end))));
     });
   }
   Linear first{nullptr}, second{nullptr};
