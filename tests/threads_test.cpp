@@ -62,7 +62,7 @@ TEST(Inference, BlocksOfRowsAreTheWhole) {
   std::vector<Coord> coords;
   for (int i = 0; i < 1300; ++i) coords.emplace_back(i % 13, i / 13 % 10, i / 130);
   const Tensor x = torch::randn({1300, 24}), context = torch::randn({300, 24});
-  const Rotary pos = rotary(coordTensor(coords), 12);
+  const Rotary pos = rotary(coordTensor(coords), 12, {});
   const auto self = [&] { return block.forward(x, &pos); };
   const auto guided = [&] {
     return block.attention->guided(x, context, torch::full({1}, .5f), [&](const Tensor& values) {
