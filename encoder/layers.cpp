@@ -116,15 +116,18 @@ Attention::Context Attention::contextOf(const Tensor& rows, const Rotary* pos) {
     });
   };
   const Tensor keys = splitHeads(through(key), heads);
-  return {pos ? rotate(keys, *pos) : keys, through(value)};
+  return {pos ? rotate(keys, *pos) : keys, through(value), {}};
 }
 
 Tensor Attention::attend(const Tensor& x, const Rotary* pos, const Context& context) {
   Tensor q = splitHeads(query->forward(x), heads);
   if (pos) q = rotate(q, *pos);
   const double scale = 1 / std::sqrt(double(q.size(2)));
-  const Tensor a = torch::matmul(q * scale, context.keys.transpose(1, 2)).softmax(-1);
-  return torch::matmul(a, splitHeads(context.values, heads)).transpose(0, 1).reshape(x.sizes());
+  Tensor scores = torch::matmul(q * scale, context.keys.transpose(1, 2));
+  if (context.bias.defined()) scores = scores + context.bias;
+  return torch::matmul(scores.softmax(-1), splitHeads(context.values, heads))
+      .transpose(0, 1)
+      .reshape(x.sizes());
 }
 
 Mlp::Mlp(int in, int hidden, int out) {
@@ -139,9 +142,10 @@ SelfBlock::SelfBlock(int width, int heads) {
   mlp = register_module("mlp", std::make_shared<Mlp>(width, 4 * width, width));
 }
 
-Tensor SelfBlock::forward(const Tensor& x, const Rotary* pos) {
+Tensor SelfBlock::forward(const Tensor& x, const Rotary* pos, const Tensor& bias) {
   const Tensor normed = norm1->forward(x);
-  const Attention::Context context = attention->contextOf(normed, pos);
+  Attention::Context context = attention->contextOf(normed, pos);
+  context.bias = bias;
   return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
     const Rotary p = pos ? pos->slice(begin, end) : Rotary();
     const Tensor y = rowRange(x, begin, end) +
@@ -156,10 +160,20 @@ Tensor SelfBlock::windowed(const Tensor& x, const Rotary* pos, const Tensor& ord
   if (n <= window) return forward(x, pos);
   std::vector<Tensor> parts(size_t((n + lead + window - 1) / window));
   inTasks(int64_t(parts.size()), [&](int64_t i) {
-    const int64_t begin = i * window - lead;
-    const Tensor rows = order.slice(0, std::max<int64_t>(0, begin), std::min(n, begin + window));
-    const Rotary p = pos ? pos->select(rows) : Rotary();
-    parts[size_t(i)] = forward(x.index_select(0, rows), pos ? &p : nullptr);
+    const int64_t begin = i * window - lead, first = std::max<int64_t>(0, begin),
+                  last = std::min(n, begin + window);
+    const Tensor rows = order.slice(0, first, last);
+    // The first and the last window may have places without a token, which nobody looks at.
+    const int64_t before = first - begin, after = begin + window - last;
+    const auto places = [&](const Tensor& t) {
+      return torch::constant_pad_nd(t.index_select(0, rows), {0, 0, before, after});
+    };
+    Tensor bias;
+    if (before || after)
+      bias = torch::constant_pad_nd(torch::zeros({last - first}), {before, after}, -1e9);
+    const Rotary p = pos ? Rotary{places(pos->cos), places(pos->sin)} : Rotary();
+    parts[size_t(i)] =
+        forward(places(x), pos ? &p : nullptr, bias).slice(0, before, window - after);
   });
   Tensor inverse = torch::empty_like(order);
   inverse.index_put_({order}, torch::arange(n));

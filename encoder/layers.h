@@ -29,9 +29,6 @@ Tensor zOrder(const std::vector<Coord>& coords);
 /// the configuration's, geometric; pairs left over do not turn.
 struct Rotary {
   Tensor cos, sin;
-  Rotary select(const Tensor& rows) const {
-    return {cos.index_select(0, rows), sin.index_select(0, rows)};
-  }
   Rotary slice(int64_t begin, int64_t end) const {
     return {rowRange(cos, begin, end), rowRange(sin, begin, end)};
   }
@@ -78,6 +75,7 @@ struct Attention : torch::nn::Module {
   struct Context {
     Tensor keys;    // [H, M, C / H]
     Tensor values;  // [M, C]
+    Tensor bias;    // [M] added to every query's scores; undefined: none
   };
   Context contextOf(const Tensor& rows, const Rotary* pos);
   /// Queries from [N, C]. Returns [N, C], before the output projection.
@@ -116,8 +114,9 @@ struct Mlp : torch::nn::Module {
 /// Pre-norm transformer block: self-attention (rotary) and MLP.
 struct SelfBlock : torch::nn::Module {
   SelfBlock(int width, int heads);
-  /// All N tokens look at each other.
-  Tensor forward(const Tensor& x, const Rotary* pos);
+  /// All N tokens look at each other. `bias` [N] is added to the scores of the tokens looked at;
+  /// undefined: none.
+  Tensor forward(const Tensor& x, const Rotary* pos, const Tensor& bias = {});
   /// Within windows of `window` tokens consecutive in `order` (Z-order), where `shifted` from half
   /// a window on, as every second block is. One window where N <= window.
   Tensor windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,

@@ -160,7 +160,7 @@ TEST(EncoderAttention, WindowsAreFullAttentionAmongTheirOwnTokens) {
     for (int64_t begin = shifted ? -16 : 0; begin < 150; begin += 32) {
       const Tensor rows =
           order.slice(0, std::max<int64_t>(0, begin), std::min<int64_t>(150, begin + 32));
-      const Rotary p = pos.select(rows);
+      const Rotary p{pos.cos.index_select(0, rows), pos.sin.index_select(0, rows)};
       truth.index_copy_(0, rows, block.forward(x.index_select(0, rows), &p));
     }
     EXPECT_LT(largestDifference(block.windowed(x, &pos, order, 32, shifted), truth), 1e-5);
