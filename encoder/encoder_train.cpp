@@ -2,13 +2,13 @@
 
 #include <algorithm>
 #include <cmath>
-#include <future>
 #include <numeric>
 
 #include "encoder/network.h"
 #include "encoder/trainer.h"
 #include "splat/image_files.h"
 #include "splat/rasterize_torch.h"
+#include "vdb/threads.h"
 
 namespace vdbc {
 namespace {
@@ -183,12 +183,9 @@ Validation validate(EncoderNet& net, const std::vector<std::vector<View>>& scene
           psnr[1] / double(std::max<int64_t>(1, counted[1]))};
 }
 
-}  // namespace
-
-void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_t scene_count,
-                  const SceneSource& validation, int validation_count,
-                  const TrainSettings& settings, const TrainListener& listener,
-                  Progress& progress) {
+void train(const EncoderConfig& config, const SceneSource& scenes, int64_t scene_count,
+           const SceneSource& validation, int validation_count, const TrainSettings& settings,
+           const TrainListener& listener, Progress& progress) {
   torch::manual_seed(settings.seed);
   auto net = std::make_shared<EncoderNet>(config), average = std::make_shared<EncoderNet>(config);
   Trainer trainer(net, average, "encoder", config.toJson(), settings, listener);
@@ -205,12 +202,11 @@ void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_
       all.push_back(viewsOf(scenes, uint64_t((round * settings.batch + k) % scene_count), 3));
     return all;
   };
-  auto current = scenesOfRound(trainer.step() / kStepsPerScene);
-  std::future<std::vector<std::vector<View>>> next;
+  std::vector<std::vector<View>> current;
   progress.start("train encoder");
   while (!trainer.done()) {
-    if (!next.valid())
-      next = std::async(std::launch::async, scenesOfRound, trainer.step() / kStepsPerScene + 1);
+    if (current.empty() || trainer.step() % kStepsPerScene == 0)
+      current = scenesOfRound(trainer.step() / kStepsPerScene);
     for (int64_t k = 0; k < trainer.samples(); ++k) {
       const std::vector<View>& views = current[size_t(k)];
       // A generator per sample: a resumed run draws what an uninterrupted one would have drawn.
@@ -231,7 +227,6 @@ void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_
                                 {"split", l.occupancy.item<double>()}});
     }
     trainer.update();
-    if (trainer.step() % kStepsPerScene == 0) current = next.get();
     if (trainer.validationDue()) {
       const Validation v = validate(*average, held_out, settings.work_folder + "/validation.png");
       trainer.log({{"input_psnr", v.input_psnr}, {"novel_psnr", v.novel_psnr}});
@@ -240,6 +235,17 @@ void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_
     trainer.stopIfInterrupted(progress);
   }
   progress.end();
+}
+
+}  // namespace
+
+void trainEncoder(const EncoderConfig& config, const SceneSource& scenes, int64_t scene_count,
+                  const SceneSource& validation, int validation_count,
+                  const TrainSettings& settings, const TrainListener& listener,
+                  Progress& progress) {
+  withThreads(1, [&] {
+    train(config, scenes, scene_count, validation, validation_count, settings, listener, progress);
+  });
 }
 
 std::pair<double, double> encoderStepLoss(const EncoderConfig& config,

@@ -53,7 +53,7 @@ void inTasks(int64_t count, const Piece& piece) {
 
 /// Rows [begin, end); the tensor itself where those are all: autograd would copy a slice's
 /// gradient.
-inline at::Tensor rowsOf(const at::Tensor& t, int64_t begin, int64_t end) {
+inline at::Tensor rowRange(const at::Tensor& t, int64_t begin, int64_t end) {
   return begin == 0 && end == t.size(0) ? t : t.slice(0, begin, end);
 }
 

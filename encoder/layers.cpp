@@ -4,8 +4,6 @@
 #include <cmath>
 #include <numeric>
 
-#include "vdb/z_order.h"
-
 namespace vdbc {
 
 namespace nn = torch::nn;
@@ -17,12 +15,25 @@ Tensor coordTensor(const std::vector<Coord>& coords) {
   return t;
 }
 
+namespace {
+// Spreads the low 21 bits of v so that two zero bits follow each.
+uint64_t spreadBits(uint64_t v) {
+  v &= 0x1fffff;
+  v = (v | v << 32) & 0x1f00000000ffffull;
+  v = (v | v << 16) & 0x1f0000ff0000ffull;
+  v = (v | v << 8) & 0x100f00f00f00f00full;
+  v = (v | v << 4) & 0x10c30c30c30c30c3ull;
+  return (v | v << 2) & 0x1249249249249249ull;
+}
+}  // namespace
+
 Tensor zOrder(const std::vector<Coord>& coords) {
   constexpr int kOffset = 1 << 20;  // makes negative coordinates positive
   std::vector<uint64_t> key(coords.size());
   for (size_t i = 0; i < coords.size(); ++i)
-    key[i] = zOrderCode(uint64_t(coords[i].x() + kOffset), uint64_t(coords[i].y() + kOffset),
-                        uint64_t(coords[i].z() + kOffset));
+    key[i] = spreadBits(uint64_t(coords[i].x() + kOffset)) << 2 |
+             spreadBits(uint64_t(coords[i].y() + kOffset)) << 1 |
+             spreadBits(uint64_t(coords[i].z() + kOffset));
   Tensor order = torch::empty({int64_t(coords.size())}, torch::kInt64);
   int64_t* o = order.data_ptr<int64_t>();
   std::iota(o, o + coords.size(), 0);
@@ -60,8 +71,6 @@ Tensor sinusoidalCode(const Tensor& positions) {
 
 Tensor normalisedPositions(const Tensor& metres, const VoxelFrame& frame,
                            const PositionConfig& config) {
-  constexpr float kExtent =
-      12.8f;  // metres; larger places go beyond +-.5 and the code still differs
   const Coord lo = frame.bounds.min(), hi = frame.bounds.max();
   const Tensor origin = torch::tensor({float(lo.x() + hi.x() + 1) / 2 * frame.voxel_m,
                                        float(lo.y() + hi.y() + 1) / 2 * frame.voxel_m,
@@ -98,60 +107,27 @@ namespace {
 Tensor splitHeads(const Tensor& x, int heads) {  // [N, C] -> [H, N, C / H]
   return x.view({x.size(0), heads, -1}).transpose(0, 1);
 }
-Tensor joinHeads(const Tensor& x) {  // [H, N, C / H] -> [N, C]
-  return x.transpose(0, 1).reshape({x.size(1), -1});
-}
-
-// Values [H, M, C / H] weighed by how well their keys answer the queries [H, N, C / H].
-Tensor weigh(const Tensor& q, const Tensor& k, const Tensor& v, const Tensor& blocked = {}) {
-  const double scale = 1 / std::sqrt(double(q.size(2)));
-  Tensor a = torch::matmul(q * scale, k.transpose(1, 2));
-  if (blocked.defined()) a = a + blocked;
-  return torch::matmul(a.softmax(-1), v);
-}
-
-// A layer's results for rows [N, C].
-Tensor through(Linear& layer, const Tensor& rows) {
-  return inRowBlocks(rows.size(0), [&](int64_t begin, int64_t end) {
-    return layer->forward(rowsOf(rows, begin, end));
-  });
-}
 }  // namespace
 
 Attention::Context Attention::contextOf(const Tensor& rows, const Rotary* pos) {
-  const Tensor keys = splitHeads(through(key, rows), heads);
-  return {pos ? rotate(keys, *pos) : keys, through(value, rows)};
+  const auto through = [&](Linear& layer) {
+    return inRowBlocks(rows.size(0), [&](int64_t begin, int64_t end) {
+      return layer->forward(rowRange(rows, begin, end));
+    });
+  };
+  const Tensor keys = splitHeads(through(key), heads);
+  return {pos ? rotate(keys, *pos) : keys, through(value), {}};
 }
 
 Tensor Attention::attend(const Tensor& x, const Rotary* pos, const Context& context) {
-  const Tensor q = splitHeads(query->forward(x), heads);
-  return joinHeads(
-      weigh(pos ? rotate(q, *pos) : q, context.keys, splitHeads(context.values, heads)));
-}
-
-Tensor Attention::attendInWindows(const Tensor& x, const Rotary* pos, int64_t window,
-                                  int64_t lead) {
-  const int64_t n = x.size(0);
-  const Context context = contextOf(x, pos);
-  Tensor q = splitHeads(through(query, x), heads);
+  Tensor q = splitHeads(query->forward(x), heads);
   if (pos) q = rotate(q, *pos);
-  const Tensor v = splitHeads(context.values, heads);
-  std::vector<Tensor> parts(size_t((n + lead + window - 1) / window));
-  inTasks(int64_t(parts.size()), [&](int64_t i) {
-    const int64_t start = i * window - lead, begin = std::max<int64_t>(0, start),
-                  end = std::min(n, start + window);
-    // The first and the last window may be partly empty: padded and blocked, they round as a full
-    // one does.
-    const int64_t before = begin - start, after = start + window - end;
-    const auto cut = [&](const Tensor& t) {
-      return torch::constant_pad_nd(t.slice(1, begin, end), {0, 0, before, after});
-    };
-    Tensor blocked = torch::zeros({window});
-    blocked.slice(0, 0, before).fill_(-1e9f), blocked.slice(0, window - after).fill_(-1e9f);
-    parts[size_t(i)] = joinHeads(
-        weigh(cut(q), cut(context.keys), cut(v), blocked).slice(1, before, window - after));
-  });
-  return torch::cat(parts);
+  const double scale = 1 / std::sqrt(double(q.size(2)));
+  Tensor scores = torch::matmul(q * scale, context.keys.transpose(1, 2));
+  if (context.bias.defined()) scores = scores + context.bias;
+  return torch::matmul(scores.softmax(-1), splitHeads(context.values, heads))
+      .transpose(0, 1)
+      .reshape(x.sizes());
 }
 
 Mlp::Mlp(int in, int hidden, int out) {
@@ -166,34 +142,42 @@ SelfBlock::SelfBlock(int width, int heads) {
   mlp = register_module("mlp", std::make_shared<Mlp>(width, 4 * width, width));
 }
 
-Tensor SelfBlock::forward(const Tensor& x, const Rotary* pos) {
+Tensor SelfBlock::forward(const Tensor& x, const Rotary* pos, const Tensor& bias) {
   const Tensor normed = norm1->forward(x);
-  const Attention::Context context = attention->contextOf(normed, pos);
+  Attention::Context context = attention->contextOf(normed, pos);
+  context.bias = bias;
   return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
     const Rotary p = pos ? pos->slice(begin, end) : Rotary();
-    const Tensor y = rowsOf(x, begin, end) +
-                     attention->forward(rowsOf(normed, begin, end), pos ? &p : nullptr, context);
+    const Tensor y = rowRange(x, begin, end) +
+                     attention->forward(rowRange(normed, begin, end), pos ? &p : nullptr, context);
     return y + mlp->forward(norm2->forward(y));
   });
 }
 
 Tensor SelfBlock::windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,
                            bool shifted) {
-  const int64_t n = x.size(0);
+  const int64_t n = x.size(0), lead = shifted ? window / 2 : 0;
   if (n <= window) return forward(x, pos);
-  const Tensor sorted = x.index_select(0, order);
-  const Rotary p = pos ? pos->select(order) : Rotary();
-  const Tensor seen = attention->attendInWindows(norm1->forward(sorted), pos ? &p : nullptr, window,
-                                                 shifted ? window / 2 : 0);
+  std::vector<Tensor> parts(size_t((n + lead + window - 1) / window));
+  inTasks(int64_t(parts.size()), [&](int64_t i) {
+    const int64_t begin = i * window - lead, first = std::max<int64_t>(0, begin),
+                  last = std::min(n, begin + window);
+    const Tensor rows = order.slice(0, first, last);
+    // The first and the last window may have places without a token, which nobody looks at.
+    const int64_t before = first - begin, after = begin + window - last;
+    const auto places = [&](const Tensor& t) {
+      return torch::constant_pad_nd(t.index_select(0, rows), {0, 0, before, after});
+    };
+    Tensor bias;
+    if (before || after)
+      bias = torch::constant_pad_nd(torch::zeros({last - first}), {before, after}, -1e9);
+    const Rotary p = pos ? Rotary{places(pos->cos), places(pos->sin)} : Rotary();
+    parts[size_t(i)] =
+        forward(places(x), pos ? &p : nullptr, bias).slice(0, before, window - after);
+  });
   Tensor inverse = torch::empty_like(order);
   inverse.index_put_({order}, torch::arange(n));
-  return inRowBlocks(n,
-                     [&](int64_t begin, int64_t end) {
-                       const Tensor y = rowsOf(sorted, begin, end) +
-                                        attention->output->forward(rowsOf(seen, begin, end));
-                       return y + mlp->forward(norm2->forward(y));
-                     })
-      .index_select(0, inverse);
+  return torch::cat(parts).index_select(0, inverse);
 }
 
 void initialiseXavier(nn::Module& module) {

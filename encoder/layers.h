@@ -29,11 +29,8 @@ Tensor zOrder(const std::vector<Coord>& coords);
 /// the configuration's, geometric; pairs left over do not turn.
 struct Rotary {
   Tensor cos, sin;
-  Rotary select(const Tensor& rows) const {
-    return {cos.index_select(0, rows), sin.index_select(0, rows)};
-  }
   Rotary slice(int64_t begin, int64_t end) const {
-    return {rowsOf(cos, begin, end), rowsOf(sin, begin, end)};
+    return {rowRange(cos, begin, end), rowRange(sin, begin, end)};
   }
 };
 Rotary rotary(const Tensor& coords, int head_dim, const PositionConfig& config);
@@ -78,13 +75,12 @@ struct Attention : torch::nn::Module {
   struct Context {
     Tensor keys;    // [H, M, C / H]
     Tensor values;  // [M, C]
+    Tensor bias;    // [M] added to every query's scores; undefined: none
   };
   Context contextOf(const Tensor& rows, const Rotary* pos);
   /// Queries from [N, C]. Returns [N, C], before the output projection.
   Tensor attend(const Tensor& x, const Rotary* pos, const Context& context);
-  /// The same of self-attention within windows of `window` rows, the first one `lead` rows early.
-  Tensor attendInWindows(const Tensor& x, const Rotary* pos, int64_t window, int64_t lead);
-  /// attend(), projected.
+  /// The same, projected.
   Tensor forward(const Tensor& x, const Rotary* pos, const Context& context) {
     return output->forward(attend(x, pos, context));
   }
@@ -95,8 +91,8 @@ struct Attention : torch::nn::Module {
     const Context context = contextOf(rows, nullptr);
     const Tensor given = guide(context.values);
     return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
-      return output->forward(alpha * attend(rowsOf(x, begin, end), nullptr, context) +
-                             (1 - alpha) * rowsOf(given, begin, end));
+      return output->forward(alpha * attend(rowRange(x, begin, end), nullptr, context) +
+                             (1 - alpha) * rowRange(given, begin, end));
     });
   }
 
@@ -109,7 +105,7 @@ struct Mlp : torch::nn::Module {
   Mlp(int in, int hidden, int out);
   Tensor forward(const Tensor& x) {
     return inRowBlocks(x.size(0), [&](int64_t begin, int64_t end) {
-      return second->forward(torch::gelu(first->forward(rowsOf(x, begin, end))));
+      return second->forward(torch::gelu(first->forward(rowRange(x, begin, end))));
     });
   }
   Linear first{nullptr}, second{nullptr};
@@ -118,8 +114,9 @@ struct Mlp : torch::nn::Module {
 /// Pre-norm transformer block: self-attention (rotary) and MLP.
 struct SelfBlock : torch::nn::Module {
   SelfBlock(int width, int heads);
-  /// All N tokens look at each other.
-  Tensor forward(const Tensor& x, const Rotary* pos);
+  /// All N tokens look at each other. `bias` [N] is added to the scores of the tokens looked at;
+  /// undefined: none.
+  Tensor forward(const Tensor& x, const Rotary* pos, const Tensor& bias = {});
   /// Within windows of `window` tokens consecutive in `order` (Z-order), where `shifted` from half
   /// a window on, as every second block is. One window where N <= window.
   Tensor windowed(const Tensor& x, const Rotary* pos, const Tensor& order, int window,

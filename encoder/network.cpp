@@ -279,7 +279,7 @@ DecoderTokens EncoderNet::splitTokens(const DecoderTokens& tokens, const Split& 
   const Tensor rows = s.parent * 8 + s.slot;
   const Tensor features =
       inRowBlocks(tokens.features.size(0), [&](int64_t begin, int64_t end) {
-        return child_tokens[size_t(split)]->forward(rowsOf(tokens.features, begin, end));
+        return child_tokens[size_t(split)]->forward(rowRange(tokens.features, begin, end));
       }).view({tokens.features.size(0) * 8, -1});
   const Tensor colours = tokens.colours.reshape({-1, 1, 3}).index_select(0, rows);
   return {features.index_select(0, rows), colours.expand({-1, 8, 3})};

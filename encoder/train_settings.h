@@ -10,11 +10,12 @@
 
 namespace vdbc {
 
-/// All views of scene `index`; the same views for the same index. Called from one thread at a time,
-/// not the caller's. Training knows nothing else about where scenes come from.
+/// All views of scene `index`; the same views for the same index. Training knows nothing else about
+/// where scenes come from.
 using SceneSource = std::function<std::vector<View>(uint64_t index)>;
 
-/// The processes that train together; each works on its share of every step's samples.
+/// The processes that train together, a thread each; every one works on its share of every step's
+/// samples.
 struct TrainProcesses {
   int rank = 0, size = 1;
   std::string address = "127.0.0.1";  // where the process of rank 0 listens

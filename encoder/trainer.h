@@ -46,6 +46,7 @@ class Trainer {
   void saveCheckpoint() const;
   void loadCheckpoint();
 
+  const OneThread one_thread_;
   std::shared_ptr<torch::nn::Module> net_, average_;
   std::string config_key_, config_;
   TrainSettings settings_;

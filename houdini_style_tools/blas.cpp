@@ -1,12 +1,13 @@
 #include "houdini_style_tools/blas.h"
 
-#include <ATen/Parallel.h>
 #include <dlfcn.h>
 
 #include <algorithm>
 #include <chrono>
 #include <cstdlib>
 #include <vector>
+
+#include "encoder/inference.h"
 
 namespace vdbc {
 namespace {
@@ -64,7 +65,7 @@ void chooseCore() {
 }  // namespace
 
 void setUpProcess() {
-  at::set_num_threads(1);
+  static const OneThread one_thread;
   if (const auto set = symbol<void(int)>("openblas_set_num_threads")) set(1);
   chooseCore();
 }

@@ -4,12 +4,12 @@
 
 namespace vdbc {
 
-/// What torch and OpenBLAS offer for a whole process only. Call it first in main(): nothing of
-/// either may be running. A host that has decided about them leaves it out: our inference then
-/// still computes the same, with one thread a task, but maybe with slower kernels.
-/// - One thread for each of their operations, whichever thread asks: TBB's tasks run side by side
-///   instead. Torch and an OpenBLAS of OpenMP then start no thread; an OpenBLAS of pthreads has
-///   started its own when it was loaded (OPENBLAS_NUM_THREADS=1 prevents that), and they sleep.
+/// What torch and OpenBLAS offer for a whole process or thread only. Call it first in main():
+/// nothing of either may be running. A host that has decided about them leaves it out: our
+/// inference still computes the same, with one thread a task, but maybe with slower kernels.
+/// - One thread for each operation that the calling thread asks of them, whatever it is for;
+///   inference has that anyway. An OpenBLAS of pthreads has started its own threads when it was
+///   loaded (OPENBLAS_NUM_THREADS=1 prevents that); they sleep.
 /// - OpenBLAS's kernels. It picks them from a list of CPU models; one that is newer than the
 /// library
 ///   may get those of a CPU without AVX (measured: 5 times slower). Where the CPU can do more than

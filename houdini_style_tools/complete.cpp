@@ -1,6 +1,9 @@
 #include "houdini_style_tools/complete.h"
 
+#include <tbb/parallel_for_each.h>
+
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
@@ -10,6 +13,7 @@
 #include "splat/ply.h"
 #include "splat/rasterize.h"
 #include "vdb/latent_vdb.h"
+#include "vdb/threads.h"
 
 namespace vdbc {
 
@@ -17,19 +21,23 @@ namespace fs = std::filesystem;
 
 Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
                   const SceneSettings& settings, Progress& progress) {
-  progress.start("carve");
-  const Observation observation = observe(views, encoder.observing(settings.observing), progress);
-  progress.end();
-  progress.start("encode");
-  Place place = encoder.encode(views, observation, progress);
-  progress.end();
-  return place;
+  return withThreads(settings.threads, [&] {
+    progress.start("carve");
+    const Observation observation = observe(views, encoder.observing(settings.observing), progress);
+    progress.end();
+    progress.start("encode");
+    Place place = encoder.encode(views, observation, progress);
+    progress.end();
+    return place;
+  });
 }
 
 Place completeScene(const std::vector<View>& views, const Encoder& encoder,
                     const Completer& completer, const SceneSettings& settings, Progress& progress) {
-  return completer.complete(encodeScene(views, encoder, settings, progress), settings.completion,
-                            progress);
+  return withThreads(settings.threads, [&] {
+    return completer.complete(encodeScene(views, encoder, settings, progress), settings.completion,
+                              progress);
+  });
 }
 
 SceneVoxels sceneVoxels(const DecodedGrid& d, const Place& place) {
@@ -135,10 +143,11 @@ void writeTogether(const Writers& writers, const std::string& stem, Progress& pr
   const std::string draft = stem + ".draft";
   size_t placed = 0;
   try {
-    for (size_t i = 0; i < writers.size(); ++i) {
-      writers[i].second(draft + writers[i].first);
-      report(progress, int(100 * (i + 1) / writers.size()));
-    }
+    std::atomic<size_t> written{0};
+    tbb::parallel_for_each(writers, [&](const auto& writer) {
+      writer.second(draft + writer.first);
+      report(progress, int(100 * ++written / writers.size()));
+    });
     for (; placed < writers.size(); ++placed)
       fs::rename(draft + writers[placed].first, stem + writers[placed].first);
   } catch (...) {
@@ -212,20 +221,22 @@ DecodedGrid writePlace(const Place& place, const std::vector<View>& views, const
     decoded.gaussians.antialias = settings.antialias;
     return decoded;
   };
-  progress.start("decode");
-  const DecodedGrid decoded = decode(place);
-  progress.end();
-  Writers more = {{kLatentEnding, [&](const std::string& path) { writeLatentVdb(place, path); }}};
-  if (!views.empty())
-    more.push_back(
-        {kPictureEnding, [&](const std::string& path) {
-           const Gaussians observed = decode(observedPart(place)).gaussians;
-           writePng(contactSheet(views, observed, decoded.gaussians, settings.observing.volume.up),
-                    path);
-         }});
-  const Eigen::Vector3d up = views.empty() ? upOf(place.frame) : settings.observing.volume.up;
-  writeScene(decoded, place, stem, up, more, progress);
-  return decoded;
+  return withThreads(settings.threads, [&] {
+    progress.start("decode");
+    DecodedGrid decoded = decode(place);
+    progress.end();
+    Writers more = {{kLatentEnding, [&](const std::string& path) { writeLatentVdb(place, path); }}};
+    if (!views.empty())
+      more.push_back({kPictureEnding, [&](const std::string& path) {
+                        const Gaussians observed = decode(observedPart(place)).gaussians;
+                        writePng(contactSheet(views, observed, decoded.gaussians,
+                                              settings.observing.volume.up),
+                                 path);
+                      }});
+    const Eigen::Vector3d up = views.empty() ? upOf(place.frame) : settings.observing.volume.up;
+    writeScene(decoded, place, stem, up, more, progress);
+    return decoded;
+  });
 }
 
 void writeDecoded(const DecodedGrid& decoded, const Place& place, const std::string& stem,

@@ -16,6 +16,7 @@ struct SceneSettings {
   CompleteSettings completion;
   float child_threshold = .05f;  // of BCE-up, for voxels that were not observed
   bool antialias = false;        // decoded Gaussians are made for RasterSettings::antialias
+  int threads = 0;               // that a call may use; 0: those of the caller's task arena
 };
 
 /// The place as observed: fits the volume (voxels as the encoder's weights want them), carves,

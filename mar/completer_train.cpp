@@ -4,11 +4,11 @@
 
 #include <algorithm>
 #include <cmath>
-#include <future>
 
 #include "encoder/trainer.h"
 #include "mar/context.h"
 #include "mar/training_masks.h"
+#include "vdb/threads.h"
 
 namespace vdbc {
 namespace {
@@ -366,13 +366,10 @@ std::shared_ptr<const SeenSpace> nodeSpace(const CompletionSample& s) {
   return space;
 }
 
-}  // namespace
-
-void trainCompleter(const CompleterConfig& config, const std::vector<float>& colour_way,
-                    const SampleSource& samples, int64_t sample_count,
-                    const SampleSource& validation, int validation_count,
-                    const TrainSettings& settings, const TrainListener& listener,
-                    Progress& progress) {
+void train(const CompleterConfig& config, const std::vector<float>& colour_way,
+           const SampleSource& samples, int64_t sample_count, const SampleSource& validation,
+           int validation_count, const TrainSettings& settings, const TrainListener& listener,
+           Progress& progress) {
   torch::manual_seed(settings.seed);
   auto net = std::make_shared<CompleterNet>(config),
        average = std::make_shared<CompleterNet>(config);
@@ -404,12 +401,10 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
     }
     return all;
   };
-  std::future<std::vector<CompletionSample>> next;
   progress.start("train completer");
   while (!trainer.done()) {
     const int64_t first = trainer.firstSample();
-    const std::vector<CompletionSample> current = next.valid() ? next.get() : load(first);
-    next = std::async(std::launch::async, load, first + settings.batch);
+    const std::vector<CompletionSample> current = load(first);
     // Before the coarse stage is any good, there is nothing behind it to learn from.
     const double own_gate = 2 * trainer.step() < settings.steps ? 0 : double(config.own_gate_share);
     for (size_t k = 0; k < current.size(); ++k) {
@@ -434,6 +429,19 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
     trainer.stopIfInterrupted(progress);
   }
   progress.end();
+}
+
+}  // namespace
+
+void trainCompleter(const CompleterConfig& config, const std::vector<float>& colour_way,
+                    const SampleSource& samples, int64_t sample_count,
+                    const SampleSource& validation, int validation_count,
+                    const TrainSettings& settings, const TrainListener& listener,
+                    Progress& progress) {
+  withThreads(1, [&] {
+    train(config, colour_way, samples, sample_count, validation, validation_count, settings,
+          listener, progress);
+  });
 }
 
 CompleterStep completerStep(const CompleterConfig& config, const CompletionSample& sample,

@@ -150,23 +150,20 @@ TEST(EncoderAttention, RotaryScoresDependOnDifferencesOfPositionsOnly) {
 TEST(EncoderAttention, WindowsAreFullAttentionAmongTheirOwnTokens) {
   torch::NoGradGuard no_grad;
   torch::manual_seed(2);
-  Attention attention(24, 2);
+  SelfBlock block(24, 2);
   const std::vector<Coord> coords = scatteredCoords(150);
   const Tensor x = torch::randn({150, 24}), order = zOrder(coords);
   const Rotary pos = rotary(coordTensor(coords), 12);
-  EXPECT_LT(largestDifference(attention.windowed(x, &pos, order, 150, true),
-                              attention.forward(x, x, &pos, &pos)),
-            1e-6);
+  EXPECT_TRUE(torch::equal(block.windowed(x, &pos, order, 150, true), block.forward(x, &pos)));
   for (const bool shifted : {false, true}) {
     Tensor truth = torch::zeros({150, 24});
     for (int64_t begin = shifted ? -16 : 0; begin < 150; begin += 32) {
       const Tensor rows =
           order.slice(0, std::max<int64_t>(0, begin), std::min<int64_t>(150, begin + 32));
-      const Tensor part = x.index_select(0, rows);
-      const Rotary p = pos.select(rows);
-      truth.index_copy_(0, rows, attention.forward(part, part, &p, &p));
+      const Rotary p{pos.cos.index_select(0, rows), pos.sin.index_select(0, rows)};
+      truth.index_copy_(0, rows, block.forward(x.index_select(0, rows), &p));
     }
-    EXPECT_LT(largestDifference(attention.windowed(x, &pos, order, 32, shifted), truth), 1e-5);
+    EXPECT_LT(largestDifference(block.windowed(x, &pos, order, 32, shifted), truth), 1e-5);
   }
 }
 
@@ -244,7 +241,7 @@ TEST(EncoderGuide, AlphaOneIsPlainAttentionAndZeroTheGuideAlone) {  // E7
     return attention.guided(x, context, torch::full({1}, alpha),
                             [&](const Tensor& v) { return guide.apply(v); });
   };
-  const Tensor plain = attention.forward(x, context);
+  const Tensor plain = attention.forward(x, nullptr, attention.contextOf(context, nullptr));
   const Tensor counted = attention.output->forward(
       torch::matmul(c.dense.softmax(1).to(torch::kFloat32), attention.value->forward(context)));
   EXPECT_LT(largestDifference(mixed(1), plain), 1e-6);

@@ -74,9 +74,16 @@ Args listing(const std::string& folder) {
   return names;
 }
 
+int threadsOf(pid_t process) {
+  std::error_code ended;
+  const fs::directory_iterator tasks("/proc/" + std::to_string(process) + "/task", ended);
+  return ended ? 0 : int(std::distance(begin(tasks), end(tasks)));
+}
+
 // How a run ended: its exit code, or 128 + the signal that killed it, as a shell says.
 struct Ended {
   int code = -1;
+  int threads = 0;  // the most at a time, those that libraries start at load among them
   std::string out, err;
 };
 
@@ -118,8 +125,6 @@ class Program : public ::testing::Test {
     std::vector<char*> argv = {const_cast<char*>(program.c_str())};
     for (const std::string& a : args) argv.push_back(const_cast<char*>(a.c_str()));
     argv.push_back(nullptr);
-    // Tests run side by side: more threads than cores would only wait for each other.
-    setenv("VDB_COMPLETE_THREADS", "1", 1);
     writeText(err, "");
     pid_t pid = 0;
     const int failure = posix_spawn(&pid, program.c_str(), &actions, nullptr, argv.data(), environ);
@@ -128,17 +133,17 @@ class Program : public ::testing::Test {
     EXPECT_EQ(failure, 0) << "cannot start " << program;
     if (failure) return ended;
     int status = 0;
-    if (!signal_at.empty()) {
-      const std::string begun = "{\"stage\": \"" + signal_at + "\"";
-      while (waitpid(pid, &status, WNOHANG) == 0) {
-        if (readText(err).find(begun) != std::string::npos && (file.empty() || fs::exists(file))) {
-          kill(pid, SIGINT);
-          break;
-        }
-        std::this_thread::sleep_for(std::chrono::milliseconds(1));
+    bool signalled = signal_at.empty();
+    const std::string begun = "{\"stage\": \"" + signal_at + "\"";
+    while (waitpid(pid, &status, WNOHANG) == 0) {
+      ended.threads = std::max(ended.threads, threadsOf(pid));
+      if (!signalled && readText(err).find(begun) != std::string::npos &&
+          (file.empty() || fs::exists(file))) {
+        kill(pid, SIGINT);
+        signalled = true;
       }
+      std::this_thread::sleep_for(std::chrono::milliseconds(1));
     }
-    waitpid(pid, &status, 0);
     ended.code = WIFEXITED(status) ? WEXITSTATUS(status) : 128 + WTERMSIG(status);
     ended.out = readText(out), ended.err = readText(err);
     return ended;
@@ -822,6 +827,41 @@ TEST_F(Program, AnInterruptedCompletionIsResumedToTheSameBytes) {
   EXPECT_EQ(listing(output_), kSiblings);
   for (const std::string& name : kSiblings)
     EXPECT_TRUE(readText(output_ + "/" + name) == bytes[name]) << name;
+}
+
+TEST_F(Program, AnyNumberOfThreadsWritesTheSameBytes) {
+  NEEDS_WEIGHTS();
+  const std::string views = writeRoom("views", 3);
+  std::map<std::string, std::string> first;
+  for (const char* threads : {"1", "2", "4"}) {
+    SCOPED_TRACE(threads);
+    const Ended ended = run(complete(views, {"--threads", threads}));
+    ASSERT_EQ(ended.code, kOk) << ended.err;
+    for (const std::string& name : kSiblings) {
+      const std::string bytes = readText(output_ + "/" + name);
+      EXPECT_TRUE(first.emplace(name, bytes).first->second == bytes) << name;
+    }
+  }
+}
+
+TEST_F(Program, OneThreadIsOneThread) {
+  NEEDS_WEIGHTS();
+  const Ended idle = run({"--version"});
+  Args options = smallBox();
+  options.insert(options.end(), {"--threads", "1"});
+  const Ended ended = run(complete(writeRoom("views"), options));
+  ASSERT_EQ(ended.code, kOk) << ended.err;
+  EXPECT_EQ(ended.threads, idle.threads);
+}
+
+TEST_F(Program, WhereOpenMpMayNotHaveThreadsItStillEnds) {
+  NEEDS_WEIGHTS();
+  Args options = smallBox();
+  options.insert(options.end(), {"--threads", "2"});
+  setenv("OMP_THREAD_LIMIT", "1", 1);
+  const Ended ended = run(complete(writeRoom("views"), options));
+  unsetenv("OMP_THREAD_LIMIT");
+  EXPECT_EQ(ended.code, kOk) << ended.err;
 }
 
 TEST_F(Program, TheSeedFixesEveryByteOfThePly) {
