@@ -1,6 +1,6 @@
 #!/bin/sh
 # Time of the main job with one thread and with the default, alone and beside two busy loops:
-#   sh tests/bench_threads.sh PROGRAM VIEWS [OPTIONS of the main job]
+#   sh examples/lab/threads.sh PROGRAM VIEWS [OPTIONS of the main job]
 # Runs alternate, so that both meet the same machine; the medians of 5 are compared. Only a machine
 # with nothing else to do shows what "alone" means. Fails where the default is less than 1.5 x faster
 # than one thread alone, or takes more than 1.5 x its time beside the loops.
