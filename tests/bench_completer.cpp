@@ -5,12 +5,16 @@
 // contexts by chunk (SIDE 0: as it is) and by tree node of SIDE tokens.
 #include <benchmark/benchmark.h>
 
+#include <algorithm>
+#include <map>
 #include <set>
 
+#include "encoder/inference.h"
 #include "encoder/views/read_views.h"
 #include "encoder/weights.h"
 #include "houdini_style_tools/complete.h"
-#include "mar/network.h"
+#include "mar/growth.h"
+#include "vdb/threads.h"
 
 namespace vdbc {
 namespace {
@@ -31,16 +35,17 @@ CompleterNet& network() {
 
 void timeBlocks(benchmark::State& state, const std::vector<std::shared_ptr<SelfBlock>>& blocks,
                 int64_t tokens) {
-  const torch::NoGradGuard no_grad;
-  torch::set_num_threads(1);
+  const Inference inference;
   const CompleterConfig& c = network().config;
   const Tensor x = torch::randn({tokens, c.width});
-  const Rotary positions = rotary(torch::randint(30, {tokens, 3}), c.width / c.heads);
-  for (auto _ : state) {
-    Tensor y = x;
-    for (const auto& block : blocks) y = block->forward(y, &positions, {}, 1 << 30, false);
-    benchmark::DoNotOptimize(y.data_ptr());
-  }
+  const Rotary positions = rotary(torch::randint(30, {tokens, 3}), c.width / c.heads, c.positions);
+  withThreads(1, [&] {
+    for (auto _ : state) {
+      Tensor y = x;
+      for (const auto& block : blocks) y = block->forward(y, &positions);
+      benchmark::DoNotOptimize(y.data_ptr());
+    }
+  });
 }
 
 int64_t contextTokens() { return network().config.context_tokens + network().config.empty_tokens; }
@@ -51,36 +56,34 @@ void h2(benchmark::State& state) {
 }
 
 // Candidates of the bundled views and their growth levels.
-struct Growth {
+struct Candidates {
   std::vector<Coord> candidates;
   std::vector<int32_t> levels;
 };
-const Growth& bundledGrowth() {
-  static const Growth growth = [] {
-    const torch::NoGradGuard no_grad;
+const Candidates& bundledCandidates() {
+  static const Candidates all = [] {
+    const Inference inference;
     Progress silent;
     const Encoder encoder(kWeights + "/encoder.safetensors");
     const Place place =
         encodeScene(readViews(VDBC_SOURCE_DIR "/examples/two_views"), encoder, {}, silent);
-    const VoxelFrame& frame = place.frame;
-    const SceneTokens scene =
-        sceneTokens(poolStates(frame, *place.seen, 1), poolStates(frame, *place.seen, 2));
-    std::map<Coord, float> gate;
-    for (const Coord& c : scene.coarse_filled) gate[c] = 1;
-    network().coarseProbabilities(scene, scene.coarse_unknown, frame, &gate);
+    const float coarse_tau = CompleteSettings().coarse_tau;
+    GrowthScene scene = growthScene(place, network().config);
+    openGate(network(), coarse_tau, &scene, silent);
     std::vector<Coord> open;
-    for (const auto& [node, probability] : gate)
-      if (probability > CompleteSettings().coarse_tau) open.push_back(node);
-    Growth g;
-    g.candidates = unobservedChildren(open, scene.nodes);
-    g.levels = breadthFirstLevels(g.candidates, place.ijk);
-    return g;
+    for (size_t i = 0; i < scene.gate.size(); ++i)
+      if (scene.gate.values()[i] > coarse_tau) open.push_back(scene.gate.tokens()[i]);
+    std::sort(open.begin(), open.end());
+    Candidates c;
+    c.candidates = unobservedChildren(open, scene.tokens.nodes);
+    c.levels = breadthFirstLevels(c.candidates, place.ijk);
+    return c;
   }();
-  return growth;
+  return all;
 }
 
 void chunks(benchmark::State& state) {
-  const Growth& g = bundledGrowth();
+  const Candidates& g = bundledCandidates();
   const int side = int(state.range(0)), size = network().config.chunk_tokens;
   std::set<Coord> nodes;
   std::map<std::pair<int32_t, Coord>, int> targets;  // of a level in a node

@@ -4,9 +4,11 @@
 #include <openvdb/tree/ValueAccessor.h>
 #include <tbb/global_control.h>
 
+#include <array>
 #include <cmath>
 #include <functional>
 #include <limits>
+#include <map>
 #include <random>
 #include <set>
 
@@ -90,6 +92,10 @@ void expectSameAsTraversal(const VoxelFrame& frame, const std::vector<OwnedView>
   Progress progress;
   const SeenSpace fast = carve(frame, borrow(views), settings, progress);
   const SeenSpace truth = carveByTraversal(frame, borrow(views), settings);
+  for (const SeenSpace* space : {&fast, &truth}) {
+    EXPECT_EQ(space->level, 0) << what;
+    EXPECT_EQ(space->box, frame.bounds) << what;
+  }
   EXPECT_TRUE(sameVoxels(fast.filled, truth.filled)) << what;
   EXPECT_TRUE(sameVoxels(fast.empty, truth.empty))
       << what << ": " << fast.empty.activeVoxelCount() << " of " << truth.empty.activeVoxelCount()
@@ -459,29 +465,32 @@ TEST(UsableDepth, DropsFlyingPixelsAndKeepsSlopesAndEdges) {
   EXPECT_EQ(usableDepth({row, jump.data()}, settings), jump);
 }
 
-TEST(PoolStates, EqualsBruteForce) {
+TEST(Carve, PoolsToNodesByTheRule) {
   VoxelFrame frame = roomFrame(0.1f, 0.2);
   for (const Coord& shift : {Coord(0, 0, 0), Coord(1, 3, -2)}) {
     frame.bounds.translate(shift);  // nodes at the border are cut at other places
     Progress progress;
     const SeenSpace space = carve(frame, borrow(roomViews(120, 90, 60)), {}, progress);
     for (int level = 0; level <= 4; ++level) {
-      const NodeStates pooled = poolStates(frame, space, level);
+      const SeenSpace pooled = poolSeen(space, level);
+      EXPECT_EQ(pooled.level, level);
       EXPECT_EQ(pooled.box, CoordBBox(tokenCoord(frame.bounds.min(), level),
                                       tokenCoord(frame.bounds.max(), level)));
-      std::vector<int> voxels(pooled.states.size()), filled(voxels), empty(voxels);
+      std::map<Coord, std::array<int, 3>> counts;  // of voxels, filled and empty ones
       for (auto c = frame.bounds.begin(); c; ++c) {
-        const size_t node = size_t(pooled.index(tokenCoord(*c, level)));
-        ++voxels[node];
-        filled[node] += space.filled.isValueOn(*c);
-        empty[node] += space.empty.isValueOn(*c);
+        auto& [voxels, filled, empty] = counts[tokenCoord(*c, level)];
+        ++voxels;
+        filled += space.filled.isValueOn(*c);
+        empty += space.empty.isValueOn(*c);
       }
+      EXPECT_EQ(counts.size(), pooled.box.volume());
       std::set<NodeState> kinds;
-      for (size_t i = 0; i < voxels.size(); ++i) {
-        const NodeState expected = filled[i]               ? NodeState::kFilled
-                                   : empty[i] == voxels[i] ? NodeState::kEmpty
-                                                           : NodeState::kUnobserved;
-        EXPECT_EQ(pooled.states[i], expected) << "level " << level << " node " << i;
+      for (const auto& [node, count] : counts) {
+        const auto& [voxels, filled, empty] = count;
+        const NodeState expected = filled            ? NodeState::kFilled
+                                   : empty == voxels ? NodeState::kEmpty
+                                                     : NodeState::kUnobserved;
+        EXPECT_EQ(pooled.at(node), expected) << "level " << level << " node " << node;
         kinds.insert(expected);
       }
       if (level < 4) {

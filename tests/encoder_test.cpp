@@ -137,14 +137,76 @@ TEST(EncoderAttention, RotaryScoresDependOnDifferencesOfPositionsOnly) {
   torch::manual_seed(1);
   const Tensor q = torch::randn({1, 1, 40}), k = torch::randn({1, 1, 40});
   const auto score = [&](const Coord& a, const Coord& b) {
-    return (rotate(q, rotary(coordTensor({a}), 40)) * rotate(k, rotary(coordTensor({b}), 40)))
-        .sum()
-        .item<double>();
+    const auto at = [](const Coord& c) { return rotary(coordTensor({c}), 40, PositionConfig()); };
+    return (rotate(q, at(a)) * rotate(k, at(b))).sum().item<double>();
   };
   const Coord a(3, -2, 5), b(-1, 4, 2), shift(17, -30, 8);
   EXPECT_NEAR(score(a, b), score(a + shift, b + shift), 1e-4);
   EXPECT_GT(std::abs(score(a, b) - score(a + shift, b)), 1e-2);
   EXPECT_NEAR(score(a, a), (q * k).sum().item<double>(), 1e-5);
+}
+
+TEST(EncoderAttention, TurnsByFrequenciesBetweenTheConfigurationsOwn) {
+  PositionConfig config;
+  config.rotary_highest = 1.2f, config.rotary_lowest = .3f;
+  const Rotary turned = rotary(coordTensor({Coord(1, 0, 0), Coord(0, 0, -2)}), 40, config);
+  ASSERT_EQ(turned.cos.sizes(), (std::vector<int64_t>{2, 20}));
+  // 5 pairs for each axis, and 5 that do not turn.
+  std::multiset<double> found[2], truth[2];
+  for (int row : {0, 1})
+    for (int i = 0; i < 20; ++i) {
+      const double angle =
+          std::atan2(turned.sin[row][i].item<double>(), turned.cos[row][i].item<double>());
+      if (std::abs(angle) > 1e-6) found[row].insert(angle);
+    }
+  for (int i = 0; i < 5; ++i) {
+    const double frequency = 1.2 * std::pow(.3 / 1.2, i / 4.);
+    truth[0].insert(frequency);
+    truth[1].insert(std::remainder(-2 * frequency, 2 * M_PI));
+  }
+  for (int row : {0, 1}) {
+    ASSERT_EQ(found[row].size(), 5u);
+    for (auto f = found[row].begin(), t = truth[row].begin(); f != found[row].end(); ++f, ++t)
+      EXPECT_NEAR(*f, *t, 1e-5);
+  }
+}
+
+TEST(EncoderAttention, PositionsAreSharesOfTheConfigurationsExtent) {
+  VoxelFrame frame;
+  frame.bounds = CoordBBox(Coord(-10, 0, 4), Coord(29, 59, 23)), frame.voxel_m = .2f;
+  const Tensor coords = coordTensor({Coord(-4, 3, 5), Coord(2, 20, 9)});
+  PositionConfig config;
+  const Tensor own = tokenPositions(coords, 1, frame, config);
+  config.extent_m *= 2;
+  EXPECT_LT(largestDifference(tokenPositions(coords, 1, frame, config), own / 2), 1e-7);
+  // Between two tokens: their distance in metres.
+  EXPECT_LT(largestDifference((own[1] - own[0]) * PositionConfig().extent_m,
+                              torch::tensor({6 * .4f, 17 * .4f, 4 * .4f})),
+            1e-5);
+}
+
+TEST(EncoderAttention, SelfBlocksAreTheirFormulaAlsoInBlocksOfRows) {
+  torch::manual_seed(2);
+  SelfBlock block(24, 2);
+  const std::vector<Coord> coords = scatteredCoords(700);  // more than one block of rows
+  const Tensor x = torch::randn({700, 24});
+  const Rotary pos = rotary(coordTensor(coords), 12, PositionConfig());
+  const Tensor normed = block.norm1->forward(x);
+  const auto heads = [](const Tensor& rows) { return rows.view({700, 2, 12}).transpose(0, 1); };
+  Attention& a = *block.attention;
+  for (const Rotary* p : {&pos, static_cast<const Rotary*>(nullptr)}) {
+    Tensor q = heads(a.query->forward(normed)), k = heads(a.key->forward(normed));
+    if (p) q = rotate(q, *p), k = rotate(k, *p);
+    const Tensor scores = (torch::matmul(q, k.transpose(1, 2)) / std::sqrt(12.)).softmax(2);
+    const Tensor mixed =
+        torch::matmul(scores, heads(a.value->forward(normed))).transpose(0, 1).reshape({700, 24});
+    const Tensor y = x + a.output->forward(mixed);
+    const Tensor truth = y + block.mlp->second->forward(
+                                 torch::gelu(block.mlp->first->forward(block.norm2->forward(y))));
+    EXPECT_LT(largestDifference(block.forward(x, p), truth), 1e-5);  // with gradients: whole
+    torch::NoGradGuard no_grad;
+    EXPECT_LT(largestDifference(block.forward(x, p), truth), 1e-5);
+  }
 }
 
 TEST(EncoderAttention, WindowsAreFullAttentionAmongTheirOwnTokens) {
@@ -153,7 +215,7 @@ TEST(EncoderAttention, WindowsAreFullAttentionAmongTheirOwnTokens) {
   SelfBlock block(24, 2);
   const std::vector<Coord> coords = scatteredCoords(150);
   const Tensor x = torch::randn({150, 24}), order = zOrder(coords);
-  const Rotary pos = rotary(coordTensor(coords), 12);
+  const Rotary pos = rotary(coordTensor(coords), 12, PositionConfig());
   EXPECT_TRUE(torch::equal(block.windowed(x, &pos, order, 150, true), block.forward(x, &pos)));
   for (const bool shifted : {false, true}) {
     Tensor truth = torch::zeros({150, 24});
@@ -398,7 +460,7 @@ TEST(EncoderNet, PatchesAreUpdatedFromTheNewVoxelTokens) {  // E6, eq. 2
   BidirectionalBlock block(c, true);
   const Tensor x3 = torch::randn({in.coords.size(0), c.width}),
                x2 = torch::randn({in.patches.size(0), c.width});
-  const Rotary pos = rotary(in.coords, c.width / c.heads);
+  const Rotary pos = rotary(in.coords, c.width / c.heads, c.positions);
   const auto update = [&] {
     Tensor new3 = x3, new2 = x2;
     block.forward(&new3, &new2, in, pos, 0);
@@ -410,7 +472,7 @@ TEST(EncoderNet, PatchesAreUpdatedFromTheNewVoxelTokens) {  // E6, eq. 2
   Tensor truth =
       x2 + block.cross2->guided(block.norm2->forward(x2), block.context3->forward(before.first),
                                 torch::full({1}, .5f), guide);
-  truth = block.self2->forward(truth, nullptr, torch::arange(x2.size(0)), 1 << 20, false);
+  truth = block.self2->forward(truth, nullptr);
   EXPECT_LT(largestDifference(before.second, truth), 1e-5);
   // Old tokens of both kinds stay; only the new 3-D tokens change.
   block.self3->mlp->second->bias.slice(0, 0, 4) += 1;

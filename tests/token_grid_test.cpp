@@ -1,8 +1,10 @@
 #include "vdb/token_grid.h"
 
 #include <gtest/gtest.h>
+#include <openvdb/tree/ValueAccessor.h>
 
 #include <algorithm>
+#include <cmath>
 #include <random>
 #include <set>
 
@@ -34,6 +36,47 @@ TEST(TokenCoord, ChildOfParentIsTheTokenItself) {
     EXPECT_EQ(childCoord(tokenCoord(c, 1), childSlot(c)), c);
     EXPECT_EQ(childSlot(c), int(TokenMask::LeafNodeType::coordToOffset(c)));
   }
+}
+
+TEST(TokenCoord, VoxelsOfANodeAreThoseWhoseTokenItIs) {
+  for (int level = 0; level <= 4; ++level)
+    for (const Coord& node : {Coord(0), Coord(-1, 2, -3), Coord(5, -4, 1)}) {
+      const CoordBBox voxels = voxelsIn(node, level);
+      EXPECT_EQ(voxels.min(), firstVoxel(node, level));
+      CoordBBox around = voxels;
+      around.expand(2);
+      for (auto c = around.begin(); c; ++c)
+        EXPECT_EQ(voxels.isInside(*c), tokenCoord(*c, level) == node);
+    }
+}
+
+TEST(TokenCoord, NodesInABoxAreThoseOfItsVoxels) {
+  std::mt19937 rng(8);
+  const auto pick = [&](int low, int high) { return low + int(rng() % unsigned(high - low + 1)); };
+  for (int trial = 0; trial < 50; ++trial) {
+    const Coord low(pick(-9, 9), pick(-9, 9), pick(-9, 9));
+    const CoordBBox box(low, low + Coord(pick(0, 6), pick(0, 6), pick(0, 6)));
+    for (int level = 0; level <= 3; ++level) {
+      std::set<Coord> expected, found;
+      for (auto c = box.begin(); c; ++c) expected.insert(tokenCoord(*c, level));
+      for (auto node = nodesIn(box, level).begin(); node; ++node) found.insert(*node);
+      EXPECT_EQ(found, expected);
+    }
+  }
+}
+
+TEST(TokenMask, AnyAndAllVoxelsOfANode) {
+  TokenMask mask;
+  mask.addTile(2, Coord(-4, 8, 0), true, true);  // 4^3
+  mask.setValueOn(Coord(1, 1, 1)), mask.setValueOff(Coord(-4, 8, 0));
+  const openvdb::tree::ValueAccessor<const TokenMask> look(mask);
+  for (int level = 0; level <= 3; ++level)
+    for (auto node = nodesIn(CoordBBox(Coord(-9), Coord(15)), level).begin(); node; ++node) {
+      int on = 0, all = 0;
+      for (auto c = voxelsIn(*node, level).begin(); c; ++c, ++all) on += mask.isValueOn(*c);
+      EXPECT_EQ(anyVoxelOn(mask, *node, level), on > 0);
+      EXPECT_EQ(allVoxelsOn(look, *node, level), on == all);
+    }
 }
 
 TEST(TokenGrid, ActiveSetEqualsTheSetOfCoordinates) {

@@ -29,8 +29,8 @@ void forEachActiveBox(const TokenMask& mask, const CoordBBox& bounds, const Visi
 }  // namespace
 
 SeenSpace poolSeen(const SeenSpace& voxels, int level) {
-  require(voxels.level == 0 && level >= 0 && level < 16,
-          "poolSeen: expected voxels and a level of 0-15, found levels ", voxels.level, " and ",
+  require(voxels.level == 0 && level >= 0 && level <= 10,  // counts of voxels fit 32 bits
+          "poolSeen: expected voxels and a level of 0-10, found levels ", voxels.level, " and ",
           level);
   SeenSpace pooled;
   pooled.level = level;
@@ -40,39 +40,22 @@ SeenSpace poolSeen(const SeenSpace& voxels, int level) {
     pooled.filled.sparseFill(nodesIn(box, level), true, true);
   });
 
-  // Voxels of E in nodes that a tile does not cover whole: counted against the node's own.
+  // Tiles and nodes are aligned: a tile is nodes in whole, or it lies in one and counts there.
   TokenIndexTree count(0);
   openvdb::tree::ValueAccessor<TokenIndexTree> counts(count);
-  const auto voxelsOf = [&](const Coord& node) {
-    CoordBBox box = voxelsIn(node, level);
-    box.intersect(voxels.box);
-    return box;
-  };
   forEachActiveBox(voxels.empty, voxels.box, [&](const CoordBBox& box) {
     const CoordBBox nodes = nodesIn(box, level);
-    const auto addPart = [&](const Coord& node) {
-      CoordBBox part = voxelsOf(node);
-      part.intersect(box);
-      counts.setValue(node, counts.getValue(node) + int32_t(part.volume()));
-    };
-    if (nodes.min() == nodes.max()) {
-      addPart(nodes.min());
-      return;
-    }
-    // Nodes inside are E for sure; what sticks out at the faces is counted.
-    CoordBBox inside = nodes;
-    for (int axis = 0; axis < 3; ++axis) {
-      Coord low = nodes.min(), high = nodes.max();
-      if (voxelsOf(low).min()[axis] < box.min()[axis]) ++inside.min()[axis];
-      if (voxelsOf(high).max()[axis] > box.max()[axis]) --inside.max()[axis];
-    }
-    if (!inside.empty()) pooled.empty.sparseFill(inside, true, true);
-    for (auto node = nodes.begin(); node; ++node)
-      if (!inside.isInside(*node)) addPart(*node);
+    if (nodes.min() == nodes.max())
+      counts.setValue(nodes.min(), counts.getValue(nodes.min()) + int32_t(box.volume()));
+    else
+      pooled.empty.sparseFill(nodes, true, true);
   });
   openvdb::tree::ValueAccessor<TokenMask> empty(pooled.empty);
-  for (auto v = count.cbeginValueOn(); v; ++v)
-    if (uint64_t(*v) == voxelsOf(v.getCoord()).volume()) empty.setValueOn(v.getCoord());
+  for (auto v = count.cbeginValueOn(); v; ++v) {
+    CoordBBox box = voxelsIn(v.getCoord(), level);
+    box.intersect(voxels.box);
+    if (uint64_t(*v) == box.volume()) empty.setValueOn(v.getCoord());
+  }
   pooled.empty.topologyDifference(pooled.filled);
   openvdb::tools::prune(pooled.empty);
   return pooled;

@@ -42,7 +42,7 @@ class StateLookup {
 };
 
 /// Voxels pooled to nodes of `level`: F if any voxel is F, E if all voxels in the box are E, else
-/// U. Throws Error for levels below 0 or above 15, and unless `voxels` are of level 0.
+/// U. Throws Error for levels below 0 or above 10, and unless `voxels` are of level 0.
 SeenSpace poolSeen(const SeenSpace& voxels, int level);
 
 /// The part of `space` in a box of nodes; what lies outside of `space` is U.
