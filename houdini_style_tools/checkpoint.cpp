@@ -3,6 +3,7 @@
 #include <nlohmann/json.hpp>
 #include <type_traits>
 
+#include "houdini_style_tools/options.h"
 #include "vdb/file_io.h"
 #include "vdb/latent_vdb.h"
 
@@ -35,20 +36,12 @@ std::string hashOf(const TokenMask& mask) {
 
 std::string completionIdentity(const Completer& completer, const Place& start,
                                const CompleteSettings& s) {
-  return json{{"completer", completer.hash()},
-              {"start", hashOf(start)},
-              {"first_level", s.first_level},
-              {"tau", s.tau},
-              {"coarse_tau", s.coarse_tau},
-              {"hole_tau", s.hole_tau},
-              {"neighbours", int(s.neighbours)},
-              {"sampling_steps", s.sampling_steps},
-              {"temperature", s.temperature},
-              {"generated_context", s.generated_context},
-              {"refine_observed", s.refine_observed},
-              {"seed", s.seed},
-              {"region", s.region ? hashOf(*s.region) : ""}}
-      .dump();
+  CompleteSettings same = s;
+  json identity{{"completer", completer.hash()},
+                {"start", hashOf(start)},
+                {"region", s.region ? hashOf(*s.region) : ""}};
+  for (const Option& o : identityOptions(&same)) identity[o.name()] = o.text();
+  return identity.dump();
 }
 
 void writeCheckpoint(const Place& so_far, int32_t next_level, const std::string& identity,
@@ -66,12 +59,12 @@ void readCheckpoint(const std::string& path, const std::string& identity, Place*
   json growth = json::parse(place.growth, nullptr, false);
   require(
       growth.is_object() && growth.contains(kNextLevel) && growth[kNextLevel].is_number_integer(),
-      "--resume: ", path, ": expected a completion that was cut short, found another latent file");
+      path, ": expected a completion that was cut short, found another latent file");
   const int32_t next_level = growth[kNextLevel];
   growth.erase(kNextLevel);
-  require(growth.dump() == identity && place.encoder_hash == start->encoder_hash,
-          "--resume: ", path, ": is of another place, settings or weights (expected ", identity,
-          ", found ", growth.dump(), ")");
+  require(growth.dump() == identity && place.encoder_hash == start->encoder_hash, path,
+          ": is of another place, settings or weights (expected ", identity, ", found ",
+          growth.dump(), ")");
   place.growth.clear();
   *start = std::move(place);
   settings->first_level = next_level, settings->resumed = true;

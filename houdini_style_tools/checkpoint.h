@@ -7,7 +7,7 @@
 namespace vdbc {
 
 /// What has to be equal for one completion to go on where another stopped (JSON): the completer,
-/// what it starts from and all settings.
+/// what it starts from and all settings that an option changes (identityOptions).
 std::string completionIdentity(const Completer& completer, const Place& start,
                                const CompleteSettings& settings);
 

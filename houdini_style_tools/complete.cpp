@@ -191,15 +191,14 @@ void requireCreatable(const std::string& path) {
   if (!fs::exists(folder)) {
     std::error_code error;
     fs::create_directories(folder, error);
-    require(!error, "--output: ", folder.string(), ": cannot create the folder: ", error.message());
+    require(!error, folder.string(), ": cannot create the folder: ", error.message());
   }
-  require(fs::is_directory(folder), "--output: ", folder.string(), ": expected a folder");
-  require(!fs::is_directory(path), "--output: ", path,
-          ": is a folder (expected a file, or nothing)");
+  require(fs::is_directory(folder), folder.string(), ": expected a folder");
+  require(!fs::is_directory(path), path, ": is a folder (expected a file, or nothing)");
   // Asking the file system beats access(): root may pass access() on a read-only mount.
   const std::string probe = path + ".probe.tmp";
   std::FILE* f = std::fopen(probe.c_str(), "wb");
-  require(f != nullptr, "--output: ", folder.string(), ": the folder is not writable");
+  require(f != nullptr, folder.string(), ": the folder is not writable");
   std::fclose(f);
   std::remove(probe.c_str());
 }
@@ -207,7 +206,7 @@ void requireCreatable(const std::string& path) {
 std::string outputStem(const std::string& path, const std::vector<std::string>& more) {
   const fs::path p(path);
   if (p.extension() != ".vdb" || p.stem().empty() || p.stem().extension() == ".latent")
-    throw UsageError(joinText("--output: ", path, ": expected a name that ends in .vdb"));
+    throw UsageError(joinText("output: ", path, ": expected a name that ends in .vdb"));
   const std::string stem = (p.has_parent_path() ? p.parent_path() / p.stem() : p.stem()).string();
   for (const char* ending : kSceneEndings) requireCreatable(stem + ending);
   for (const std::string& ending : more) requireCreatable(stem + ending);

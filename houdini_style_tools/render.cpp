@@ -76,8 +76,7 @@ std::vector<Frame> numbered(const std::vector<Camera>& cameras, std::vector<int>
   std::vector<Frame> result;
   for (int f : frames) {
     if (f < 0 || f >= int(cameras.size()))
-      throw UsageError(
-          joinText("--frames: expected numbers below ", cameras.size(), ", found ", f));
+      throw UsageError(joinText("frames: expected numbers below ", cameras.size(), ", found ", f));
     result.push_back({f, cameras[size_t(f)], ""});
   }
   return result;
@@ -96,8 +95,7 @@ std::vector<Frame> framesToRender(const RenderSettings& s, const Gaussians& g) {
   if (!s.flythrough) reading.frames = s.frames;
   const std::vector<View> views = readViews(s.cameras, reading);
   if (s.flythrough > 0) {
-    require(views.size() > 1, "--flythrough: ", s.cameras, ": expected at least 2 cameras, found ",
-            views.size());
+    require(views.size() > 1, s.cameras, ": expected at least 2 cameras, found ", views.size());
     std::vector<Camera> through;
     for (const View& v : views) through.push_back(fitted(v.camera, s));
     return numbered(flythroughCameras(through, s.flythrough), s.frames);
@@ -111,14 +109,13 @@ std::vector<Frame> framesToRender(const RenderSettings& s, const Gaussians& g) {
 
 void requireSettings(const RenderSettings& s) {
   if (s.turntable && s.flythrough)
-    throw UsageError("render: --turntable, --flythrough: expected one of them");
+    throw UsageError("turntable: expected no flight through cameras beside it");
   if (s.turntable && !s.cameras.empty())
-    throw UsageError("render: --turntable, --cameras: expected one of them");
+    throw UsageError("turntable: expected no cameras beside it");
   if (!s.turntable && s.cameras.empty())
-    throw UsageError("render: expected --cameras VIEWS or --turntable N");
+    throw UsageError("cameras: expected views, or a turntable");
   if (s.preview && fs::path(s.output).extension() != ".exr")
-    throw UsageError(
-        joinText("render: --preview: expected an output that ends in .exr, found ", s.output));
+    throw UsageError(joinText("preview: expected an output that ends in .exr, found ", s.output));
 }
 
 /// Where frames go: a pattern with #. Makes the folder.
@@ -128,13 +125,13 @@ std::string outputPattern(const std::string& output, size_t frames) {
   if (!is_file) {
     if (output.find('#') != std::string::npos)
       throw UsageError(
-          joinText("--output: ", output, ": expected a name with # that ends in .png or .exr"));
+          joinText("output: ", output, ": expected a name with # that ends in .png or .exr"));
     std::error_code error;
     fs::create_directories(output, error);
     require(!error && fs::is_directory(output), "render: ", output, ": cannot create the folder");
   } else if (frames > 1 && fs::path(output).filename().string().find('#') == std::string::npos) {
     throw UsageError(
-        joinText("--output: ", output, ": expected #### in the name of ", frames, " frames"));
+        joinText("output: ", output, ": expected #### in the name of ", frames, " frames"));
   }
   const std::string pattern = is_file ? output : output + "/####.png";
   requireCreatable(framePath(pattern, 0));

@@ -451,7 +451,8 @@ TEST_F(InstalledAssets, RolesOfFourHaveBothSides) {
 TEST_F(InstalledAssets, TableIsWhatReadingFinds) {
   std::ifstream in(VDBC_SOURCE_DIR "/examples/rooms/models.tsv");
   const std::string table{std::istreambuf_iterator<char>(in), {}};
-  EXPECT_TRUE(modelTable(assets()) == table) << "write models.tsv anew with make_rooms";
+  EXPECT_TRUE(modelTable(assets()) == table)
+      << "write models.tsv anew with vdb_lab make_rooms table";
 }
 
 TEST_F(InstalledAssets, UsableModelsHaveTheirSizeAndFiniteRows) {

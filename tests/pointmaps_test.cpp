@@ -257,14 +257,14 @@ TEST(Pointmap, ScaleIsGivenOrFromTheBaselineOrRefused) {
   Arrays unknown = arraysOf(scene, 1);
   unknown.members.erase("c2w");
   writeNpz(unknown.list(), path);
-  EXPECT_SAYS(errorOf(path, {}), "--scale");
+  EXPECT_SAYS(errorOf(path, {}), "expected metres per unit");
   writeNpz(arraysOf(ballInBox(1), 1).list(), path);  // one camera has no baseline
-  EXPECT_SAYS(errorOf(path, {}), "--scale");
+  EXPECT_SAYS(errorOf(path, {}), "expected metres per unit");
   expectScene(readViews(path, scaled(1)), ballInBox(1), 1e-5);
   Scene still = ballInBox();
   for (Camera& c : still.cameras) c.world_from_camera = still.cameras[0].world_from_camera;
   writeNpz(arraysOf(still, 1).list(), path);
-  EXPECT_SAYS(errorOf(path, {}), "--scale");
+  EXPECT_SAYS(errorOf(path, {}), "expected metres per unit");
 }
 
 TEST(Pointmap, OnlyPointmapsTakeAScale) {

@@ -1,240 +1,8 @@
-// The program as its users meet it: exit codes, error lines, what is left behind, what is written.
-#include <fcntl.h>
-#include <gtest/gtest.h>
-#include <spawn.h>
-#include <sys/wait.h>
-#include <unistd.h>
-
-#include <algorithm>
-#include <chrono>
-#include <cmath>
-#include <csignal>
-#include <cstdlib>
-#include <filesystem>
-#include <fstream>
-#include <limits>
-#include <map>
-#include <nlohmann/json.hpp>
-#include <set>
-#include <string>
-#include <thread>
-#include <vector>
-
-#include "encoder/views/read_views.h"
-#include "splat/image_files.h"
-#include "splat/ply.h"
-#include "splat/points_vdb.h"
-#include "splat/rasterize.h"
-#include "splat/view.h"
-#include "tests/simple_room.h"
-#include "tests/view_files.h"
-#include "vdb/error.h"
-#include "vdb/fit_volume.h"
-#include "vdb/latent_vdb.h"
-#include "vdb/scene_vdb.h"
-
-#ifndef VDBC_WEIGHTS
-#define VDBC_WEIGHTS VDBC_SOURCE_DIR "/weights/small"
-#endif
-
-extern char** environ;
+// vdb_complete as its users meet it.
+#include "tests/program.h"
 
 namespace vdbc {
 namespace {
-
-namespace fs = std::filesystem;
-using nlohmann::json;
-using Args = std::vector<std::string>;
-
-constexpr int kOk = 0, kFailed = 1, kUsage = 2, kInterrupted = 130;
-const Args kSiblings = {"x.latent.vdb", "x.ply", "x.png", "x.points.vdb", "x.vdb"};  // sorted
-
-std::string readText(const std::string& path) {
-  std::ifstream in(path, std::ios::binary);
-  return {std::istreambuf_iterator<char>(in), std::istreambuf_iterator<char>()};
-}
-
-void writeText(const std::string& path, const std::string& text) {
-  std::ofstream(path, std::ios::binary) << text;
-}
-
-std::vector<std::string> lines(const std::string& text) {
-  std::vector<std::string> result;
-  std::stringstream in(text);
-  for (std::string line; std::getline(in, line);) result.push_back(line);
-  return result;
-}
-
-// Everything below a folder, sorted.
-Args listing(const std::string& folder) {
-  Args names;
-  for (const auto& entry : fs::recursive_directory_iterator(folder))
-    names.push_back(fs::relative(entry.path(), folder).string());
-  std::sort(names.begin(), names.end());
-  return names;
-}
-
-int threadsOf(pid_t process) {
-  std::error_code ended;
-  const fs::directory_iterator tasks("/proc/" + std::to_string(process) + "/task", ended);
-  return ended ? 0 : int(std::distance(begin(tasks), end(tasks)));
-}
-
-// How a run ended: its exit code, or 128 + the signal that killed it, as a shell says.
-struct Ended {
-  int code = -1;
-  int threads = 0;  // the most at a time, those that libraries start at load among them
-  std::string out, err;
-};
-
-// The program that has the arguments' verb.
-std::string programOf(const Args& args) {
-  const bool of_lab = !args.empty() && (args[0] == "eval" || args[0] == "train");
-  return of_lab ? VDBC_LAB : VDBC_PROGRAM;
-}
-
-// A scratch folder with small inputs, and the programs to run on them.
-class Program : public ::testing::Test {
- protected:
-  void SetUp() override {
-    std::string name = (fs::temp_directory_path() / "vdbc_program_XXXXXX").string();
-    ASSERT_NE(mkdtemp(name.data()), nullptr);
-    root_ = name;
-    output_ = root_ + "/out";
-    fs::create_directory(output_);
-  }
-  void TearDown() override {
-    std::error_code ignored;
-    fs::remove_all(root_, ignored);
-  }
-
-  std::string at(const std::string& name) const { return root_ + "/" + name; }
-
-  // Starts a program; with `signal_at`, sends SIGINT once that stage has begun (needs --json) and
-  // that file is there.
-  Ended run(const Args& args, const std::string& signal_at = "",
-            const std::string& file = "") const {
-    const std::string out = at("stdout.txt"), err = at("stderr.txt");
-    posix_spawn_file_actions_t actions;
-    posix_spawn_file_actions_init(&actions);
-    const int flags = O_WRONLY | O_CREAT | O_TRUNC;
-    posix_spawn_file_actions_addopen(&actions, 0, "/dev/null", O_RDONLY, 0);
-    posix_spawn_file_actions_addopen(&actions, 1, out.c_str(), flags, 0600);
-    posix_spawn_file_actions_addopen(&actions, 2, err.c_str(), flags, 0600);
-    const std::string program = programOf(args);
-    std::vector<char*> argv = {const_cast<char*>(program.c_str())};
-    for (const std::string& a : args) argv.push_back(const_cast<char*>(a.c_str()));
-    argv.push_back(nullptr);
-    writeText(err, "");
-    pid_t pid = 0;
-    const int failure = posix_spawn(&pid, program.c_str(), &actions, nullptr, argv.data(), environ);
-    posix_spawn_file_actions_destroy(&actions);
-    Ended ended;
-    EXPECT_EQ(failure, 0) << "cannot start " << program;
-    if (failure) return ended;
-    int status = 0;
-    bool signalled = signal_at.empty();
-    const std::string begun = "{\"stage\": \"" + signal_at + "\"";
-    while (waitpid(pid, &status, WNOHANG) == 0) {
-      ended.threads = std::max(ended.threads, threadsOf(pid));
-      if (!signalled && readText(err).find(begun) != std::string::npos &&
-          (file.empty() || fs::exists(file))) {
-        kill(pid, SIGINT);
-        signalled = true;
-      }
-      std::this_thread::sleep_for(std::chrono::milliseconds(1));
-    }
-    ended.code = WIFEXITED(status) ? WEXITSTATUS(status) : 128 + WTERMSIG(status);
-    ended.out = readText(out), ended.err = readText(err);
-    return ended;
-  }
-
-  // A failure: this exit code, nothing on stdout, one line on stderr that says `named`, and the
-  // output folder as it was.
-  void expectFailure(const Args& args, int code, const std::string& named) const {
-    std::string command;
-    for (const std::string& a : args) command += " " + a;
-    const std::string program = fs::path(programOf(args)).filename().string();
-    SCOPED_TRACE(program + command);
-    const Args before = listing(output_);
-    const Ended ended = run(args);
-    EXPECT_EQ(ended.code, code);
-    EXPECT_EQ(ended.out, "");
-    EXPECT_EQ(std::count(ended.err.begin(), ended.err.end(), '\n'), 1) << ended.err;
-    EXPECT_EQ(ended.err.rfind(program + ": ", 0), 0u) << ended.err;
-    EXPECT_NE(ended.err.find(named), std::string::npos)
-        << ended.err << "expected to name: " << named;
-    EXPECT_EQ(listing(output_), before);
-  }
-
-  Args complete(const std::string& views, const Args& more = {}) const {
-    Args args = {views, "-o", output_ + "/x.vdb", "--weights", VDBC_WEIGHTS};
-    args.insert(args.end(), more.begin(), more.end());
-    return args;
-  }
-
-  // Bad views: the message names `named`, or else the views.
-  void expectBadViews(const std::string& views, const std::string& named = "",
-                      const Args& more = {}) const {
-    expectFailure(complete(views, more), kFailed, named.empty() ? views : named);
-  }
-
-  // Views of a room, small enough to complete in a second.
-  static std::vector<View> roomViews(int count) { return simpleRoomViews(count, 64, 48, 7); }
-
-  std::string writeRoom(const std::string& name, int count = 2) const {
-    writeViews(roomViews(count), at(name));
-    return at(name);
-  }
-
-  // A box of 1.6 m around what the first view looks at: completed in half a second.
-  static Args smallBox() {
-    const View view = roomViews(1)[0];
-    const Camera& c = view.camera;
-    const int x = c.width / 2, y = c.height / 2;
-    const Eigen::Vector3d centre = c.unproject(x + .5, y + .5, view.depth[size_t(y * c.width + x)]);
-    Args args = {"--bounds"};
-    for (double side : {-.8, .8})
-      for (int axis = 0; axis < 3; ++axis) args.push_back(std::to_string(centre[axis] + side));
-    return args;
-  }
-
-  // Every voxel of a small box, for files to damage.
-  std::string writeVolume() const {
-    SceneVoxels v;
-    v.frame.bounds = CoordBBox(Coord(0), Coord(7));
-    for (auto i = CoordBBox(Coord(0), Coord(3)).begin(); i; ++i) {
-      v.ijk.push_back(*i);
-      v.colour_linear.emplace_back(.2f, .4f, .6f);
-      v.density.push_back(1), v.observed.push_back(1), v.probability.push_back(1),
-          v.bfs_level.push_back(0);
-    }
-    writeSceneVdb(v, at("volume.vdb"));
-    return at("volume.vdb");
-  }
-
-  std::string writeSplats() const {
-    Gaussians g;
-    g.resize(50, 0);
-    for (size_t i = 0; i < 50; ++i) {
-      g.mean[i] = Eigen::Vector3f(float(i % 7), float(i % 5), float(i % 3));
-      g.log_scale[i] = Eigen::Vector3f::Constant(-2);
-      g.rotation[i] = Eigen::Vector4f(1, 0, 0, 0);
-      g.opacity_logit[i] = 2;
-    }
-    writePly(g, at("splats.ply"));
-    return at("splats.ply");
-  }
-
-  std::string root_, output_;
-};
-
-bool haveWeights() {
-  return fs::exists(VDBC_WEIGHTS "/encoder.safetensors") &&
-         fs::exists(VDBC_WEIGHTS "/completer.safetensors");
-}
-#define NEEDS_WEIGHTS() \
-  if (!haveWeights()) GTEST_SKIP() << "no trained weights in " << VDBC_WEIGHTS
 
 // ---- the command line
 
@@ -244,7 +12,6 @@ TEST_F(Program, UsageErrorsExitWith2) {
   expectFailure({"--frobnicate"}, kUsage, "--frobnicate");
   expectFailure({views, "frobnicate", "-o", x}, kUsage, "frobnicate");
   expectFailure({views}, kUsage, "-o");
-  expectFailure({"train"}, kUsage, "subcommand");
   expectFailure({"render", at("a.ply"), "-o", output_}, kUsage, "--cameras");
   expectFailure({"render", at("a.xyz"), "--cameras", views, "-o", output_}, kUsage, at("a.xyz"));
   expectFailure(complete(views, {"--seed", "one"}), kUsage, "--seed");
@@ -261,9 +28,6 @@ TEST_F(Program, ValuesThatCannotBeExitWith2) {
   expectFailure(complete(views, {"--tau", "1.5"}), kUsage, "--tau");
   for (const char* frames : {"3-", "2-1", "0,,1", "0;1"})
     expectFailure(complete(views, {std::string("--frames=") + frames}), kUsage, frames);
-  for (const char* change : {"width", "none=1", "width=wide", "width=7"})
-    expectFailure({"train", "encoder", "-o", at("w.safetensors"), "--set", change}, kUsage,
-                  "--set");
 }
 
 TEST_F(Program, FramesOutOfRangeNameTheViews) {
@@ -274,24 +38,29 @@ TEST_F(Program, FramesOutOfRangeNameTheViews) {
   expectBadViews(at("one.exr"), "", {"--frames", "1"});
 }
 
-TEST_F(Program, HelpOfEveryVerbListsTheCommonOptions) {
-  const std::vector<Args> verbs = {
-      {},         {"info"},  {"encode"}, {"decode"},           {"rethreshold"},
-      {"render"}, {"check"}, {"eval"},   {"train", "encoder"}, {"train", "mar"}};
-  for (Args args : verbs) {
-    args.push_back("--help");
-    SCOPED_TRACE(testing::PrintToString(args));
-    const Ended ended = run(args);
+TEST_F(Program, HelpIsOfTheVerbOrOfAllOfThem) {
+  const Args verbs = {"encode", "decode", "rethreshold", "render", "check", "info"};
+  const Ended front = run({"--help"});
+  EXPECT_EQ(front.code, kOk);
+  EXPECT_EQ(front.err, "");
+  EXPECT_NE(front.out.find("--tau"), std::string::npos);
+  for (const std::string& verb : verbs) {
+    SCOPED_TRACE(verb);
+    EXPECT_NE(front.out.find("\n  " + verb + " "), std::string::npos);
+    const Ended ended = run({verb, "--help"});
     EXPECT_EQ(ended.code, kOk);
     EXPECT_EQ(ended.err, "");
-    for (const char* option : {"--help", "--seed", "--threads", "--json"})
-      EXPECT_NE(ended.out.find(option), std::string::npos) << option;
-    if (args.size() > 1) continue;
-    for (const Args& verb : verbs)  // the front page lists them all
-      if (!verb.empty() && programOf(verb) == VDBC_PROGRAM) {
-        EXPECT_NE(ended.out.find("\n  " + verb[0] + " "), std::string::npos) << verb[0];
-      }
+    EXPECT_EQ(ended.out.rfind("vdb_complete " + verb + ": ", 0), 0u) << ended.out;
+    EXPECT_TRUE(run({verb, "-h"}).out == ended.out);
   }
+  EXPECT_EQ(lines(run({"--version"}).out).size(), 1u);
+}
+
+TEST_F(Program, IsWithoutFurnitureAndTraining) {
+  const std::string binary = readText(VDBC_PROGRAM);
+  ASSERT_GT(binary.size(), 100000u);
+  for (const char* of_the_lab : {"libpugixml", "tinyobj", "sweethome3d", "make_rooms", "torchrun"})
+    EXPECT_EQ(binary.find(of_the_lab), std::string::npos) << of_the_lab;
 }
 
 TEST_F(Program, InfoIsOneJsonObject) {
@@ -303,19 +72,6 @@ TEST_F(Program, InfoIsOneJsonObject) {
   EXPECT_FALSE(info.at("version").get<std::string>().empty());
   EXPECT_EQ(info.at("threads"), 1);
   EXPECT_GT(info.at("gflops").get<double>(), 0);
-}
-
-TEST_F(Program, EvalRefusesTrainingRooms) {
-  for (const char* seed : {"900000", "1000005", "1099999"})
-    expectFailure({"eval", "--scenes", std::string("rooms:") + seed, "--weights", VDBC_WEIGHTS},
-                  kFailed, seed);
-  expectFailure({"eval", "--scenes", "rooms:899999-900000", "--weights", VDBC_WEIGHTS}, kFailed,
-                "900000");
-  expectFailure({"eval", "--scenes", "rooms:one"}, kUsage, "rooms:one");
-  for (const char* option : {"--lpips", "--features"})
-    expectFailure({"eval", "--scenes", "rooms:1", option, at("none.pt")}, kFailed, option);
-  expectFailure({"eval", "--scenes", at("missing"), "--weights", VDBC_WEIGHTS}, kFailed,
-                at("missing"));
 }
 
 // ---- views that cannot be used
@@ -468,10 +224,6 @@ TEST_F(Program, OutputsThatCannotBe) {
     expectFailure({views, "-o", name, "--weights", VDBC_WEIGHTS}, kUsage, name);
   for (const std::string& folder : {at("file"), at("file") + "/deeper", std::string("/proc")})
     expectFailure({views, "-o", folder + "/x.vdb", "--weights", VDBC_WEIGHTS}, kFailed, folder);
-  expectFailure({"train", "encoder", "-o", output_}, kUsage, output_);
-  expectFailure(
-      {"train", "encoder", "-o", at("file") + "/x.safetensors", "--work", output_ + "/work"},
-      kFailed, at("file"));
   fs::create_directory(output_ + "/x.ply");
   expectFailure(complete(views), kFailed, output_ + "/x.ply");
   expectFailure({"render", splats, "--cameras", views, "-o", at("file")}, kFailed, at("file"));
@@ -1021,97 +773,6 @@ TEST_F(Program, CheckFindsCarvedVoxelsInAgreement) {
   EXPECT_GT(result.at("within_two_voxels").get<double>(), .8);
   EXPECT_GT(result.at("open_directions").get<double>(), 0);  // two views see a part of the room
   EXPECT_LT(result.at("open_directions").get<double>(), 1);
-}
-
-TEST_F(Program, EvalPrintsEveryMethodOnce) {
-  NEEDS_WEIGHTS();
-  const std::string folder = writeRoom("views", 3);
-  const Ended ended =
-      run({"eval", "--scenes", folder, "--views", "2", "--weights", VDBC_WEIGHTS, "--coarse-tau",
-           "1", "--taus", ".2", "0.75", "--pictures", at("pictures"), "--json"});
-  ASSERT_EQ(ended.code, kOk) << ended.err;
-  std::map<std::string, int> scene, mean;
-  for (const std::string& line : lines(ended.out)) {
-    const json result = json::parse(line);
-    ++(result.at("scene") == "mean" ? mean : scene)[result.at("method").get<std::string>()];
-    EXPECT_GT(result.at("psnr").get<double>(), 0);
-    EXPECT_GT(result.at("flip").get<double>(), 0);
-    EXPECT_LT(result.at("flip").get<double>(), 1);
-    EXPECT_TRUE(result.at("lpips").is_null());  // no network was given
-    for (const char* of_truth :
-         {"f1", "iou", "shell_recall", "furniture_recall", "outside", "ece", "leak"})
-      EXPECT_TRUE(result.at(of_truth).is_null()) << of_truth;
-    if (result.at("method") != "box") {
-      EXPECT_GT(result.at("depth_rmse_m").get<double>(), result.at("depth_median_m").get<double>());
-      EXPECT_GT(result.at("depth_share").get<double>(), 0);
-    }
-  }
-  const std::map<std::string, int> once = {
-      {"box", 1},     {"completed", 1}, {"completed-tau-0.2", 1}, {"completed-tau-0.75", 1},
-      {"nearest", 1}, {"observed", 1},  {"pixel-aligned", 1}};
-  EXPECT_EQ(scene, once);
-  EXPECT_EQ(mean, once);
-  const Image sheet = readImage(at("pictures/0.png"));
-  const View view = readViews(folder).front();
-  EXPECT_EQ(sheet.width, 5 * view.camera.width);  // truth, observed, nearest, box, completed
-  EXPECT_EQ(sheet.height, view.camera.height);    // the one other view
-  expectFailure({"eval", "--scenes", folder, "--views", "3", "--weights", VDBC_WEIGHTS}, kFailed,
-                folder);
-}
-
-TEST_F(Program, EvalReconstructNeedsOnlyTheEncoder) {
-  NEEDS_WEIGHTS();
-  const std::string folder = writeRoom("views", 3), weights = at("weights");
-  fs::create_directory(weights);
-  fs::copy(VDBC_WEIGHTS "/encoder.safetensors", weights);
-  const Ended ended = run({"eval", "--reconstruct", "--scenes", folder, "--views", "2", "--weights",
-                           weights, "--optimise", "0.2", "--pictures", at("pictures"), "--json"});
-  ASSERT_EQ(ended.code, kOk) << ended.err;
-  Args methods;
-  for (const std::string& line : lines(ended.out)) {
-    const json result = json::parse(line);
-    methods.push_back(result.at("scene").get<std::string>() == "mean" ? "mean"
-                                                                      : result.at("method"));
-    EXPECT_EQ(result.at("views"), 2);
-    EXPECT_TRUE(result.at("leak").is_null());  // no truth
-    for (const char* kind : {"input", "other"}) {
-      EXPECT_GT(result.at(std::string(kind) + "_psnr").get<double>(), 5);
-      EXPECT_GT(result.at(std::string(kind) + "_flip").get<double>(), 0);
-    }
-    EXPECT_EQ(result.at("decode_seconds").is_null(), result.at("method") != "reconstructed");
-  }
-  EXPECT_EQ(methods, (Args{"reconstructed", "voxel-mean", "pixel-aligned", "optimised", "mean",
-                           "mean", "mean", "mean"}));
-  const Image sheet = readImage(at("pictures/0.png"));
-  EXPECT_EQ(sheet.width % 5, 0);   // the truth and four methods
-  EXPECT_EQ(sheet.height % 3, 0);  // two input views and the one other
-}
-
-TEST_F(Program, TrainingRefusesAStartThatIsNoCompleterBeforeAnyWork) {
-  NEEDS_WEIGHTS();
-  for (const std::string& from :
-       {at("missing.safetensors"), std::string(VDBC_WEIGHTS "/encoder.safetensors")}) {
-    expectFailure({"train", "mar", "--encoder", VDBC_WEIGHTS "/encoder.safetensors", "--from", from,
-                   "-o", at("new.safetensors")},
-                  kFailed, from);
-    EXPECT_FALSE(fs::exists(at("new.safetensors.work")));
-  }
-}
-
-TEST_F(Program, EvalReconstructRefusesOptionsOfTheCompletion) {
-  const Args reconstruct = {"eval", "--scenes", "rooms:1", "--reconstruct"};
-  for (const Args& more : std::vector<Args>{{"--tau", ".1"},
-                                            {"--taus", ".1"},
-                                            {"--random-order"},
-                                            {"--lpips", "x.pt"},
-                                            {"--refine-observed"},
-                                            {"--optimise", "-1"},
-                                            {"--optimise", "nan"}}) {
-    Args args = reconstruct;
-    args.insert(args.end(), more.begin(), more.end());
-    expectFailure(args, kUsage, more[0]);
-  }
-  expectFailure({"eval", "--scenes", "rooms:1", "--optimise", "1"}, kUsage, "--reconstruct");
 }
 
 TEST_F(Program, AnInterruptLeavesNothing) {

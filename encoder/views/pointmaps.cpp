@@ -73,11 +73,11 @@ PointmapScale scaleOf(const Poses& extrinsic, const Poses& c2w, double given,
   if (extrinsic.empty()) return {1, "c2w"};
   require(!c2w.empty(), kReadViews, ": ", path,
           ": pointmaps of unknown scale (expected metres per ",
-          "unit, --scale, or metric poses `c2w` besides `extrinsic`)");
+          "unit, or metric poses `c2w` besides `extrinsic`)");
   const double metres = spread(c2w), units = spread(extrinsic);
   require(metres >= kMinBaselineM && units > 1e-9 && std::isfinite(metres / units), kReadViews,
           ": ", path, ": ", c2w.size(), " cameras with a baseline of ", metres,
-          " m do not tell the pointmaps' scale (expected metres per unit: --scale)");
+          " m do not tell the pointmaps' scale (expected metres per unit)");
   return {metres / units, "camera baseline"};
 }
 
@@ -250,7 +250,7 @@ Eigen::Vector3d pointmapUp(const std::string& path) {
   for (const auto& pose : c2w.empty() ? extrinsic : c2w) up -= pose.linear().col(1);
   const auto count = double(std::max(extrinsic.size(), c2w.size()));
   require(up.norm() > 0.1 * count, kReadViews, ": ", path,
-          ": the cameras do not tell where up is (expected --up)");
+          ": the cameras do not tell where up is (expected the direction that points up)");
   return up.normalized();
 }
 

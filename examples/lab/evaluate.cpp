@@ -12,6 +12,7 @@
 #include "examples/lab/scenes.h"
 #include "examples/lab/scores.h"
 #include "examples/rooms/rooms.h"
+#include "houdini_style_tools/verb.h"
 #include "splat/image_files.h"
 #include "splat/metrics.h"
 #include "splat/rasterize.h"
@@ -234,6 +235,15 @@ Eigen::MatrixXd rowsOf(const std::vector<std::vector<float>>& rows) {
   return m;
 }
 
+// Those of rooms:N-N or homes:N-N.
+std::vector<uint64_t> sceneNumbers(const std::string& spec) {
+  try {
+    return numberRanges(spec.substr(spec.find(':') + 1));
+  } catch (const UsageError& e) {
+    throw UsageError(joinText("--scenes: ", spec, ": ", e.what()));
+  }
+}
+
 }  // namespace
 
 SceneList sceneList(const std::string& spec, int views, const std::vector<int>& frames,
@@ -241,29 +251,23 @@ SceneList sceneList(const std::string& spec, int views, const std::vector<int>& 
   const bool is_rooms = spec.rfind("rooms:", 0) == 0, is_homes = spec.rfind("homes:", 0) == 0;
   if (!is_rooms && !is_homes)
     return {1, [=](int64_t) { return folderScene(spec, views, frames, seed); }};
-  unsigned long long first = 0, last = 0;
-  int used = 0;
-  const char* text = spec.c_str() + 6;
-  const int found = std::sscanf(text, "%llu%n-%llu%n", &first, &used, &last, &used);
-  if (found == 1) last = first;
-  if (found < 1 || text[used] != '\0' || last < first || last - first > 100000)
-    throw UsageError(
-        joinText("--scenes: ", spec, ": expected rooms:N, rooms:N-N, homes:N or homes:N-N"));
   if (!frames.empty()) throw UsageError("--frames: expected a folder as --scenes, found rooms");
+  const std::vector<uint64_t> numbers = sceneNumbers(spec);
+  const auto count = int64_t(numbers.size());
   if (is_rooms) {
-    for (uint64_t s : {uint64_t(first), uint64_t(last)}) requireHeldOut(s);
-    return {int64_t(last - first + 1), [=](int64_t i) {
-              const uint64_t s = first + uint64_t(i);
-              requireHeldOut(s);
-              return roomScene(makeRoom(roomAssets(), s), s, views);
+    for (uint64_t room : numbers) requireHeldOut(room);
+    return {count, [=](int64_t i) {
+              const uint64_t room = numbers[size_t(i)];
+              return roomScene(makeRoom(roomAssets(), room), room, views);
             }};
   }
-  const int homes = homeRoomCount(roomAssets());
-  if (last >= uint64_t(homes))
-    throw UsageError(joinText("--scenes: ", spec, ": expected numbers below ", homes));
-  return {int64_t(last - first + 1), [=](int64_t i) {
-            const int index = int(first) + int(i);
-            return roomScene(homeRoom(roomAssets(), index), uint64_t(index), views);
+  const auto homes = uint64_t(homeRoomCount(roomAssets()));
+  for (uint64_t home : numbers)
+    if (home >= homes)
+      throw UsageError(joinText("--scenes: ", spec, ": expected numbers below ", homes));
+  return {count, [=](int64_t i) {
+            const uint64_t home = numbers[size_t(i)];
+            return roomScene(homeRoom(roomAssets(), int(home)), home, views);
           }};
 }
 

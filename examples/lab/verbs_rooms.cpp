@@ -1,20 +1,19 @@
-// make_rooms: furnished rooms as folders of RGB-D views with their truth, the example homes,
+// Furnished rooms as folders of RGB-D views with their truth, the example homes,
 // contact sheets and statistics.
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <cstdio>
-#include <exception>
 #include <filesystem>
 #include <map>
+#include <memory>
 #include <nlohmann/json.hpp>
 #include <set>
-#include <sstream>
 #include <string>
 #include <vector>
 
 #include "encoder/views/read_views.h"
+#include "examples/lab/verbs_lab.h"
 #include "examples/rooms/rooms.h"
 #include "splat/exr.h"
 #include "splat/image_files.h"
@@ -29,39 +28,16 @@ namespace fs = std::filesystem;
 using Eigen::Vector3f;
 using nlohmann::ordered_json;
 
-constexpr uint64_t kMaxRooms = 100000;
 constexpr int kTileSide = 128, kSheetColumns = 8;
 constexpr float kTruthVoxel = .1f;  // metres
 
-struct Options {
-  std::string seeds, output;
+struct RoomOptions {
+  std::vector<uint64_t> seeds;
+  std::string output;
   int views = 8, samples = kRoomSamples;
   std::vector<int> size{224};  // width, or width and height
   bool truth = false, aovs = false;
 };
-
-// "3,10-19": seeds in the order given.
-std::vector<uint64_t> seedList(const std::string& text) {
-  std::vector<uint64_t> seeds;
-  std::stringstream parts(text);
-  for (std::string part; std::getline(parts, part, ',');) {
-    unsigned long long first = 0, last = 0;
-    int used = 0;
-    const bool digits = !part.empty() &&
-                        part.find_first_not_of("0123456789-") == std::string::npos &&
-                        part.front() != '-';
-    const int found =
-        digits ? std::sscanf(part.c_str(), "%llu%n-%llu%n", &first, &used, &last, &used) : 0;
-    if (found == 1) last = first;
-    if (found < 1 || size_t(used) != part.size() || last < first || last - first >= kMaxRooms)
-      throw UsageError(
-          joinText("--seeds: ", text, ": expected numbers and ranges such as 3,10-19"));
-    for (uint64_t i = 0; i <= last - first; ++i) seeds.push_back(first + i);
-  }
-  if (seeds.empty())
-    throw UsageError("--seeds: expected numbers and ranges such as 3,10-19, found nothing");
-  return seeds;
-}
 
 void writeAovs(const RoomPicture& p, const std::string& path) {
   std::vector<float> depth = p.view.depth, material(p.material.begin(), p.material.end());
@@ -81,7 +57,7 @@ void writeAovs(const RoomPicture& p, const std::string& path) {
 }
 
 // FOLDER/{transforms.json, color, depth} and what the options add; returns the sheet's picture.
-Image writeRoom(const Room& room, uint64_t seed, const Options& o, const std::string& folder) {
+Image writeRoom(const Room& room, uint64_t seed, const RoomOptions& o, const std::string& folder) {
   const int width = o.size.front(), height = o.size.back();
   const RoomRenderer renderer(room);
   const std::vector<View> views =
@@ -119,9 +95,9 @@ void writeSheet(const std::vector<Image>& pictures, const std::string& folder) {
   writePng(tileImages(tiles, kSheetColumns), folder + "/sheet.png");
 }
 
-void makeRooms(const AssetLibrary& assets, const Options& o) {
+void makeRooms(const AssetLibrary& assets, const RoomOptions& o) {
   std::vector<Image> pictures;
-  for (uint64_t seed : seedList(o.seeds)) {
+  for (uint64_t seed : o.seeds) {
     const std::string folder = o.output + "/" + std::to_string(seed);
     pictures.push_back(isWritten(folder) ? firstPicture(folder)
                                          : writeRoom(makeRoom(assets, seed), seed, o, folder));
@@ -129,7 +105,7 @@ void makeRooms(const AssetLibrary& assets, const Options& o) {
   writeSheet(pictures, o.output);
 }
 
-void makeHomes(const AssetLibrary& assets, const Options& o) {
+void makeHomes(const AssetLibrary& assets, const RoomOptions& o) {
   std::vector<Image> pictures;
   const int count = homeRoomCount(assets);
   for (int i = 0; i < count; ++i) {
@@ -182,7 +158,7 @@ Image modelPicture(const AssetLibrary& assets, size_t model, int side) {
   return RoomRenderer(room).render(camera, 16, 1).colour;
 }
 
-void makeModelSheet(const AssetLibrary& assets, const std::string& path) {
+void makeModelSheet(const AssetLibrary& assets, const RoomOptions& o) {
   constexpr int kSide = 96, kColumns = 30;
   std::vector<Image> pictures;
   for (size_t i = 0; i < assets.models().size(); ++i) {
@@ -190,7 +166,7 @@ void makeModelSheet(const AssetLibrary& assets, const std::string& path) {
     if (m.role != "none" && m.fault.empty()) pictures.push_back(modelPicture(assets, i, kSide));
   }
   require(!pictures.empty(), "make_rooms models: expected usable models, found none");
-  writePng(tileImages(pictures, kColumns), path);
+  writePng(tileImages(pictures, kColumns), o.output);
   std::printf("%zu models\n", pictures.size());
 }
 
@@ -267,15 +243,14 @@ ordered_json statisticsOf(const AssetLibrary& assets, uint64_t seed, Totals* tot
 }
 
 // One JSON line a room, and one of all of them: mean, least and most.
-void printStatistics(const AssetLibrary& assets, const Options& o) {
-  const std::vector<uint64_t> seeds = seedList(o.seeds);
+void printStatistics(const AssetLibrary& assets, const RoomOptions& o) {
   Totals totals;
-  for (uint64_t seed : seeds) {
+  for (uint64_t seed : o.seeds) {
     std::printf("%s\n", statisticsOf(assets, seed, &totals).dump().c_str());
     std::fflush(stdout);
   }
   ordered_json all{
-      {"rooms", seeds.size()}, {"models_used", totals.models.size()}, {"kinds", totals.kinds}};
+      {"rooms", o.seeds.size()}, {"models_used", totals.models.size()}, {"kinds", totals.kinds}};
   for (auto& [key, values] : totals.values) {
     const auto [least, most] = std::minmax_element(values.begin(), values.end());
     double sum = 0;
@@ -285,70 +260,59 @@ void printStatistics(const AssetLibrary& assets, const Options& o) {
   std::printf("%s\n", all.dump().c_str());
 }
 
-// --- program
-// --------------------------------------------------------------------------------------
+// --- verbs
+// ----------------------------------------------------------------------------------------
 
-void addPictures(CLI::App* verb, Options* o) {
-  verb->add_option("--views", o->views, "pictures a room")
-      ->check(CLI::Range(1, 1000))
-      ->capture_default_str();
-  verb->add_option("--size", o->size, "pixels: width, or width and height")
-      ->expected(1, 2)
-      ->check(CLI::Range(8, 4096))
-      ->capture_default_str();
-  verb->add_option("--samples", o->samples, "paths a pixel")
-      ->check(CLI::Range(1, 65536))
-      ->capture_default_str();
-  verb->add_flag("--truth", o->truth, "mesh.ply and truth.vdb of each room too");
-  verb->add_flag("--aovs", o->aovs, "aovs.####.exr too: scene-linear colour, normal, Z, material");
+std::vector<Option> pictureOptions(RoomOptions* o) {
+  return {option("-o,--output FOLDER", &o->output, "for SEED/transforms.json, ... and sheet.png")
+              .required(),
+          option("--views N", &o->views, "pictures a room").between(1, 1000),
+          option("--size WIDTH [HEIGHT]", &o->size, "in pixels").between(8, 4096),
+          option("--samples N", &o->samples, "paths a pixel").between(1, 65536),
+          flag("--truth", &o->truth, "mesh.ply and truth.vdb of each room too"),
+          flag("--aovs", &o->aovs, "aovs.####.exr too: scene-linear colour, normal, Z, material")};
 }
 
-int run(int argc, char** argv) {
-  Options o;
-  CLI::App app{"Furnished rooms from Sweet Home 3D's Debian packages, path-traced.", "make_rooms"};
-  app.require_subcommand(1);
-  CLI::App* rooms = app.add_subcommand(
-      "rooms", "furnished rooms: OUTPUT/SEED/transforms.json, ... and OUTPUT/sheet.png");
-  rooms
-      ->add_option(
-          "--seeds", o.seeds,
-          joinText("which, 3,10-19 say; from ", kFirstTrainingSeed, " on with training models"))
-      ->required();
-  CLI::App* homes = app.add_subcommand("homes", "the rooms of the nine example homes, likewise");
-  CLI::App* models = app.add_subcommand("models", "contact sheet (PNG) of all usable models");
-  CLI::App* statistics =
-      app.add_subcommand("statistics", "one JSON line a room: contents, and what views see of it");
-  statistics->add_option("--seeds", o.seeds, "which rooms, 3,10-19 say")->required();
-  CLI::App* credits =
-      app.add_subcommand("attribution", "creators and licences of all usable models (Markdown)");
-  CLI::App* table =
-      app.add_subcommand("table", "models.tsv anew: split, role and fault of every model");
-  for (CLI::App* verb : {rooms, homes}) addPictures(verb, &o);
-  for (CLI::App* verb : {rooms, homes, models})
-    verb->add_option("-o,--output", o.output, verb == models ? "PNG to write" : "folder to write")
-        ->required();
-  try {
-    app.parse(argc, argv);
-    const AssetLibrary assets = AssetLibrary::open();
-    if (*rooms) makeRooms(assets, o);
-    if (*homes) makeHomes(assets, o);
-    if (*models) makeModelSheet(assets, o.output);
-    if (*statistics) printStatistics(assets, o);
-    if (*credits) std::printf("%s", attribution(assets).c_str());
-    if (*table) std::printf("%s", modelTable(assets).c_str());
-    return 0;
-  } catch (const CLI::ParseError& e) {
-    return app.exit(e) == 0 ? 0 : 2;
-  } catch (const UsageError& e) {
-    std::fprintf(stderr, "make_rooms: %s\n", e.what());
-    return 2;
-  } catch (const std::exception& e) {
-    std::fprintf(stderr, "make_rooms: %s\n", e.what());
-    return 1;
-  }
+Option seedsOption(RoomOptions* o) {
+  return ranges("--seeds LIST", &o->seeds,
+                joinText("which rooms, 3,10-19 say; from ", kFirstTrainingSeed,
+                         " on with training models"))
+      .required();
+}
+
+// A verb of make_rooms; `cook` works on the installed furniture.
+Verb roomVerb(const std::string& name, std::string does, std::string example,
+              const std::shared_ptr<RoomOptions>& o, std::vector<Option> options,
+              void (*cook)(const AssetLibrary&, const RoomOptions&)) {
+  std::vector<OptionGroup> groups;
+  if (!options.empty()) groups.push_back({"", std::move(options)});
+  return {"make_rooms " + name, std::move(does), std::move(example), std::move(groups),
+          [o, cook](const Run&, Progress&) { cook(AssetLibrary::open(), *o); }};
 }
 
 }  // namespace
-}  // namespace vdbc
 
-int main(int argc, char** argv) { return vdbc::run(argc, argv); }
+std::vector<Verb> makeRoomsVerbs() {
+  const auto o = std::make_shared<RoomOptions>();
+  std::vector<Option> rooms = pictureOptions(o.get());
+  rooms.insert(rooms.begin(), seedsOption(o.get()));
+  return {
+      roomVerb("rooms", "furnished rooms as RGB-D views, path-traced",
+               "--seeds 1-8 -o out/held_out", o, rooms, makeRooms),
+      roomVerb("homes", "the rooms of the nine example homes, likewise", "-o out/homes", o,
+               pictureOptions(o.get()), makeHomes),
+      roomVerb("models", "contact sheet of all usable models", "-o out/models.png", o,
+               {option("-o,--output FILE", &o->output, "PNG to write").required()}, makeModelSheet),
+      roomVerb("statistics", "one JSON line a room: contents, and what views see of it",
+               "--seeds 1000000-1000999", o, {seedsOption(o.get())}, printStatistics),
+      roomVerb("attribution", "creators and licences of all usable models (Markdown)", "", o, {},
+               [](const AssetLibrary& assets, const RoomOptions&) {
+                 std::printf("%s", attribution(assets).c_str());
+               }),
+      roomVerb("table", "the table models.tsv anew: split, role and fault of every model", "", o,
+               {}, [](const AssetLibrary& assets, const RoomOptions&) {
+                 std::printf("%s", modelTable(assets).c_str());
+               })};
+}
+
+}  // namespace vdbc
