@@ -20,8 +20,8 @@ struct EncoderConfig {
   int decoder_blocks = 2;
   int window = 256;  // tokens per self-attention window
   int latent_dim = 64;
-  int latent_groups = 1;           // of the GroupNorm after sampling, per token; 0: none
-  float kl_weight = 1e-4f;         // beta; image error and KL are both means (spec E12)
+  int latent_groups = 1;    // of the GroupNorm after sampling, per token; 0: none
+  float kl_weight = 1e-4f;  // beta; image error and KL are both means (docs/method.md, section 3.7)
   float occupancy_weight = 0.02f;  // of BCE-up
   int gaussians_per_voxel = 8;     // M
   float guide_alpha = -1;          // fixed share of learned attention, or -1: learned, starts at .5

@@ -1,5 +1,6 @@
 #pragma once
-// The encoder-decoder: views -> sparse latent grid -> Gaussians (paper sec. 3, spec E1-E14).
+// The encoder-decoder: views -> sparse latent grid -> Gaussians (paper sec. 3; docs/method.md,
+// sections 2 and 3).
 #include <memory>
 #include <string>
 

@@ -1,5 +1,6 @@
 #pragma once
-// Training of the encoder-decoder from posed RGB-D views alone (paper sec. 3, spec E9-E14).
+// Training of the encoder-decoder from posed RGB-D views alone (paper sec. 3; docs/method.md,
+// section 3.7).
 #include "encoder/encoder.h"
 #include "encoder/train_settings.h"
 

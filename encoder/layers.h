@@ -85,7 +85,7 @@ struct Attention : torch::nn::Module {
     return output->forward(attend(x, pos, context));
   }
   /// alpha * attention + (1 - alpha) * guide, mixed before the output projection; `guide` maps
-  /// values [M, C] to [N, C] (spec E7).
+  /// values [M, C] to [N, C] (docs/method.md, section 3.2).
   template <typename Guide>
   Tensor guided(const Tensor& x, const Tensor& rows, const Tensor& alpha, const Guide& guide) {
     const Context context = contextOf(rows, nullptr);
@@ -126,15 +126,16 @@ struct SelfBlock : torch::nn::Module {
   std::shared_ptr<Mlp> mlp;
 };
 
-/// Xavier for matrices, zeros for biases (spec E13); modules that must start at zero do so
-/// afterwards.
+/// Xavier for matrices, zeros for biases (docs/method.md, section 3.7); modules that must start at
+/// zero do so afterwards.
 void initialiseXavier(torch::nn::Module& module);
 
 /// Exponential moving average of parameters: average += (1 - decay) * (value - average).
 void updateAverage(std::vector<Tensor>& average, const std::vector<Tensor>& parameters,
                    double decay);
 
-/// base * (linear warm-up, then cosine from 1 to `floor`). Spec E13, A14.
+/// base * (linear warm-up, then cosine from 1 to `floor`). See docs/method.md, sections 3.7
+/// and 5.5.
 double cosineRate(double base, int64_t step, int64_t steps, int64_t warmup, double floor);
 
 }  // namespace vdbc

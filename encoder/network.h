@@ -5,7 +5,8 @@
 
 namespace vdbc {
 
-/// Softmax of pixel counts as a uniform floor plus a sparse correction: never a dense matrix (E7).
+/// Softmax of pixel counts as a uniform floor plus a sparse correction: never a dense matrix
+/// (docs/method.md, section 3.2).
 struct CountAttention {
   Tensor rows, columns;  // [nnz] int64
   Tensor weight;         // [nnz] softmax value less the floor
@@ -66,8 +67,8 @@ struct DecoderTokens {
 };
 
 /// Places of M Gaussians in a unit voxel, [M, 3]: centres of the smallest cubic lattice with at
-/// least M cells, every cell where M is a cube and evenly spread ones elsewhere; x slowest. Spec
-/// E11.
+/// least M cells, every cell where M is a cube and evenly spread ones elsewhere; x slowest. See
+/// docs/method.md, section 3.5.
 Tensor subLattice(int64_t m);
 
 /// Raw outputs for V voxels.
@@ -82,7 +83,8 @@ struct EncoderNet : torch::nn::Module {
     Tensor mean, log_variance;  // [N, latent_dim]
   };
   Posterior encode(const EncoderInput& in);
-  /// GroupNorm over each token's channel groups (E10), or nothing with 0 groups.
+  /// GroupNorm over each token's channel groups (docs/method.md, section 3.3), or nothing with 0
+  /// groups.
   Tensor normalise(const Tensor& z);
 
   /// Tokens of latents [N, latent_dim].
@@ -108,9 +110,9 @@ struct EncoderNet : torch::nn::Module {
   std::vector<Linear> child_logits, child_tokens;
 };
 
-/// Ground truth children plus false positives (E9): count = ratio * truth, half among children next
-/// to the truth (26 neighbours), half anywhere among the children. `occupied` [N, 8] bool, `coords`
-/// of the nodes. Returns [N, 8] bool.
+/// Ground truth children plus false positives (docs/method.md, section 3.4): count = ratio * truth,
+/// half among children next to the truth (26 neighbours), half anywhere among the children.
+/// `occupied` [N, 8] bool, `coords` of the nodes. Returns [N, 8] bool.
 Tensor injectFalsePositives(const Tensor& occupied, const std::vector<Coord>& coords, float ratio,
                             torch::Generator& random);
 

@@ -1,6 +1,7 @@
 #pragma once
 // Views to voxels: which voxels the pixels fill, what they look like, and which image patches see
-// which token. No torch, no network: the geometry that the encoder stands on. Spec E2-E5, E7.
+// which token. No torch, no network: the geometry that the encoder stands on. See docs/method.md,
+// section 2.
 #include <memory>
 #include <optional>
 #include <vector>

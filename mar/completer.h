@@ -1,6 +1,6 @@
 #pragma once
 // The masked auto-regressive completer: which unseen tokens are occupied, and with which latents
-// (paper sec. 4, spec A1-A14).
+// (paper sec. 4; docs/method.md, section 4).
 #include <functional>
 #include <memory>
 #include <string>
@@ -20,13 +20,14 @@ struct CompleteSettings {
   Neighbours neighbours = Neighbours::kCorners26;
   int sampling_steps = 0;  // DDIM steps of the diffusion head; 0: its linear mean
   double temperature = 1;
-  /// Generated tokens are context of the levels after them (A11), not only the observed ones.
+  /// Generated tokens are context of the levels after them (docs/method.md, section 4.8), not only
+  /// the observed ones.
   bool generated_context = false;
   int context_tokens = 0,
       chunk_tokens = 0;  // of the fine stage instead of the weights' own; 0: those
   bool random_order =
       false;  // growth levels in which tokens come at random, as large as the breadth-first ones
-  bool refine_observed = false;  // rewrite condition latents with the refinement head (A8)
+  bool refine_observed = false;  // rewrite condition latents with the refinement head (section 4.6)
   uint64_t seed = 1;
   /// Tokens (coordinates of the latents' level) that may be generated; all where null.
   std::shared_ptr<const TokenMask> region;

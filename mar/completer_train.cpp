@@ -107,8 +107,8 @@ CoordBBox drawBounds(const CompletionSample& s, const CompleterConfig& config,
 
 namespace {
 
-// Truth and weight of positions: F 1, E 0, U 0 with the configured low weight (training.md, spec
-// A1).
+// Truth and weight of positions: F 1, E 0, U 0 with the configured low weight (docs/method.md,
+// section 5.2).
 struct Labels {
   Tensor truth, weight;  // [N]
 };
@@ -141,7 +141,7 @@ struct Losses {
 };
 
 // Target latents by position, where the dense views saw a surface: what else a file holds is no
-// truth (spec A1).
+// truth (docs/method.md, section 5.2).
 struct TargetRows {
   TokenMap<int64_t> row;
   std::vector<int64_t> all;
@@ -158,8 +158,8 @@ struct TargetRows {
   }
 };
 
-// The coarse stage: loss on a random subset of the unknown positions (A2), and its probabilities
-// there.
+// The coarse stage: loss on a random subset of the unknown positions (docs/method.md, section 5.3),
+// and its probabilities there.
 Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionSample& s,
                   const std::vector<Coord>& unknown, const VoxelFrame& frame,
                   torch::Generator& random, Gate* gate) {

@@ -1,6 +1,6 @@
 #pragma once
-// Masked training of the completer on latents of the frozen encoder (paper sec. 4, spec A2, A3,
-// A14).
+// Masked training of the completer on latents of the frozen encoder (paper sec. 4; docs/method.md,
+// section 5).
 #include <functional>
 #include <string>
 
@@ -41,7 +41,7 @@ void trainCompleter(const CompleterConfig& config, const std::vector<float>& col
 struct CompleterStep {
   double before = 0, after = 0;
   double gradient_sum = 0;                  // of absolute values
-  double trunk_gradient_of_refinement = 0;  // absolute sum; spec A8: exactly 0
+  double trunk_gradient_of_refinement = 0;  // absolute sum; docs/method.md, section 4.6: exactly 0
 };
 CompleterStep completerStep(const CompleterConfig& config, const CompletionSample& sample,
                             uint64_t seed);

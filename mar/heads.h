@@ -1,5 +1,6 @@
 #pragma once
-// Private: the completer's token-wise heads: occupancy and diffusion (spec A6-A8).
+// Private: the completer's token-wise heads: occupancy and diffusion (docs/method.md, sections 4.4
+// to 4.6).
 #include "encoder/layers.h"
 
 namespace vdbc {

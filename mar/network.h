@@ -14,7 +14,8 @@ struct TokenSet {
   std::vector<Coord> coords;
 };
 
-/// Inputs in the order H1 and H2 see them; each kind has its own linear layer and LayerNorm (A4).
+/// Inputs in the order H1 and H2 see them; each kind has its own linear layer and LayerNorm
+/// (docs/method.md, section 4.2).
 enum TokenKind { kCondition, kVisible, kEmptyToken, kTarget, kTokenKinds };
 using TokenSets = std::array<TokenSet, kTokenKinds>;
 
@@ -23,7 +24,8 @@ struct StageSizes {
   std::array<int, kTokenKinds> feature_dims;
 };
 
-/// H1 sees condition, visible and empty tokens; H2 sees H1's output and the mask tokens (A4).
+/// H1 sees condition, visible and empty tokens; H2 sees H1's output and the mask tokens
+/// (docs/method.md, section 4.2).
 struct MaskedTransformer : torch::nn::Module {
   MaskedTransformer(const StageSizes& sizes, const CompleterConfig& config);
   struct Output {

@@ -1,5 +1,6 @@
 #pragma once
-// Private: what a training step hides from the completer (paper sec. 4, spec A2).
+// Private: what a training step hides from the completer (paper sec. 4; docs/method.md,
+// section 5.3).
 #include "encoder/layers.h"
 #include "mar/completer_train.h"
 

@@ -1,5 +1,6 @@
 // Carving: voxel-driven against openvdb::math::DDA along every ray, single-threaded both; compare
-// the ratios of one run (perf.md: 25x at 10 cm, 50x at 2.5 cm). The sets must be equal.
+// the ratios of one run (docs/notes/performance.md: 25x at 10 cm, 50x at 2.5 cm). The sets must be
+// equal.
 #include <benchmark/benchmark.h>
 #include <tbb/global_control.h>
 

@@ -1,8 +1,8 @@
-// What keeping H1's output between growth levels would save (docs/performance.md). Generated tokens
-// are no context, so what H1 says of a chunk's context could be kept, if the chunks of all levels
-// had the same contexts: those of tree nodes. completer/h1 and completer/h2/TARGETS time one chunk
-// of the shipped weights; completer/chunks/SIDE counts, for the bundled views, H1 and H2 calls with
-// contexts by chunk (SIDE 0: as it is) and by tree node of SIDE tokens.
+// What keeping H1's output between growth levels would save (docs/notes/performance.md). Generated
+// tokens are no context, so what H1 says of a chunk's context could be kept, if the chunks of all
+// levels had the same contexts: those of tree nodes. completer/h1 and completer/h2/TARGETS time one
+// chunk of the shipped weights; completer/chunks/SIDE counts, for the bundled views, H1 and H2
+// calls with contexts by chunk (SIDE 0: as it is) and by tree node of SIDE tokens.
 #include <benchmark/benchmark.h>
 
 #include <algorithm>

@@ -170,8 +170,8 @@ void machineRate(benchmark::State& state, double Machine::*rate, const char* uni
 // --- rows
 // ----------------------------------------------------------------------------------------
 
-/// ../shared/perf.md's probe: ms on two cores with 332 GFLOP/s and 22 GB/s; 0 where it has no
-/// figure.
+/// The probe of docs/notes/performance.md: ms on two cores with 332 GFLOP/s and 22 GB/s; 0 where it
+/// has no figure.
 struct Row {
   int n, width, height;
   double probe_forward, probe_both;

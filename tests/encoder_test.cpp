@@ -1,4 +1,5 @@
-// Laws of the encoder-decoder and of its training (spec E1, E5-E14), on networks of toy size.
+// Laws of the encoder-decoder and of its training (docs/method.md, sections 2 and 3; numbers behind
+// tests are its sections), on networks of toy size.
 #include "encoder/encoder.h"
 
 #include <gtest/gtest.h>
@@ -265,7 +266,7 @@ Counts randomCounts(int64_t n, int64_t m) {
   return c;
 }
 
-TEST(EncoderGuide, IsTheSoftmaxOfTheCountsWithoutTheDenseMatrix) {  // E7
+TEST(EncoderGuide, IsTheSoftmaxOfTheCountsWithoutTheDenseMatrix) {  // section 3.2
   torch::manual_seed(4);
   const Counts c = randomCounts(20, 33);
   const Tensor values = torch::randn({33, 7});
@@ -279,7 +280,7 @@ TEST(EncoderGuide, IsTheSoftmaxOfTheCountsWithoutTheDenseMatrix) {  // E7
   }
 }
 
-TEST(EncoderGuide, MemoryGrowsWithTheCountedPairs) {  // E7: never [N, M]
+TEST(EncoderGuide, MemoryGrowsWithTheCountedPairs) {  // section 3.2: never [N, M]
   const int64_t n = 3000, m = 50000;
   for (size_t pairs : {100u, 1000u, 10000u}) {
     std::vector<int32_t> rows, columns;
@@ -293,7 +294,7 @@ TEST(EncoderGuide, MemoryGrowsWithTheCountedPairs) {  // E7: never [N, M]
   }
 }
 
-TEST(EncoderGuide, AlphaOneIsPlainAttentionAndZeroTheGuideAlone) {  // E7
+TEST(EncoderGuide, AlphaOneIsPlainAttentionAndZeroTheGuideAlone) {  // section 3.2
   torch::manual_seed(5);
   Attention attention(24, 2);
   const Counts c = randomCounts(20, 33);
@@ -312,7 +313,7 @@ TEST(EncoderGuide, AlphaOneIsPlainAttentionAndZeroTheGuideAlone) {  // E7
   EXPECT_GT(largestDifference(plain, counted), 1e-2);
 }
 
-TEST(EncoderGuide, ShareIsLearnedFromAHalfOrFixed) {  // E7
+TEST(EncoderGuide, ShareIsLearnedFromAHalfOrFixed) {  // section 3.2
   EncoderConfig c = toyConfig();
   const auto learned = makeNet(c, 1);
   EXPECT_EQ(learned->blocks[0]->alpha.sigmoid().item<float>(), .5f);
@@ -330,7 +331,8 @@ TEST(EncoderGuide, ShareIsLearnedFromAHalfOrFixed) {  // E7
   EXPECT_FALSE(torch::equal(learned->encode(in).mean, learned->encode(other).mean));
 }
 
-TEST(EncoderGuide, CountsPixelsOfThePatchInTheToken) {  // E7, against a loop over the pixels
+TEST(EncoderGuide,
+     CountsPixelsOfThePatchInTheToken) {  // section 3.2, against a loop over the pixels
   const std::vector<View> views = roomViews(2);
   for (int level : {1, 2}) {
     const EncoderConfig c = toyConfig(level);
@@ -361,7 +363,7 @@ TEST(EncoderGuide, CountsPixelsOfThePatchInTheToken) {  // E7, against a loop ov
 
 // --- the encoder -------------------------------------------------------------------------------
 
-TEST(EncoderInput, PatchesAreThePixelsWhereTheSizeDividesTheImage) {  // E5
+TEST(EncoderInput, PatchesAreThePixelsWhereTheSizeDividesTheImage) {  // section 2.6
   const std::vector<View> views = roomViews(2);
   for (int across : {4, 8}) {
     EncoderConfig c = toyConfig();
@@ -386,7 +388,7 @@ TEST(EncoderInput, PatchesAreThePixelsWhereTheSizeDividesTheImage) {  // E5
   }
 }
 
-TEST(EncoderInput, AnyPatchSizeRuns) {  // E5
+TEST(EncoderInput, AnyPatchSizeRuns) {  // section 2.6
   const std::vector<View> views = roomViews(2);
   for (const auto& [across, px] : {std::pair<int, int>{1, 3}, {5, 7}, {14, 16}}) {
     EncoderConfig c = toyConfig();
@@ -398,7 +400,7 @@ TEST(EncoderInput, AnyPatchSizeRuns) {  // E5
   }
 }
 
-TEST(EncoderNet, TheOrderOfViewsDoesNotMatter) {  // E6
+TEST(EncoderNet, TheOrderOfViewsDoesNotMatter) {  // section 3.1
   torch::NoGradGuard no_grad;
   const EncoderConfig c = toyConfig();
   const auto net = makeNet(c, 2);
@@ -418,7 +420,7 @@ CountAttention withColumns(const CountAttention& a, const Tensor& place) {
   return {a.rows, place.index_select(0, a.columns), a.weight, a.floor};
 }
 
-TEST(EncoderNet, PermutedVoxelsGivePermutedLatents) {  // E6
+TEST(EncoderNet, PermutedVoxelsGivePermutedLatents) {  // section 3.1
   torch::NoGradGuard no_grad;
   const std::vector<View> views = roomViews(3);
   for (int window : {32, 4096}) {
@@ -451,7 +453,7 @@ TEST(EncoderNet, PermutedVoxelsGivePermutedLatents) {  // E6
   }
 }
 
-TEST(EncoderNet, PatchesAreUpdatedFromTheNewVoxelTokens) {  // E6, eq. 2
+TEST(EncoderNet, PatchesAreUpdatedFromTheNewVoxelTokens) {  // section 3.1, paper eq. 2
   torch::NoGradGuard no_grad;
   const EncoderConfig c = toyConfig();
   const std::vector<View> views = roomViews(2);
@@ -481,7 +483,7 @@ TEST(EncoderNet, PatchesAreUpdatedFromTheNewVoxelTokens) {  // E6, eq. 2
   EXPECT_GT(largestDifference(before.second, after.second), 1e-3);
 }
 
-TEST(EncoderNet, ImagesReachTheVoxelsAndVoxelsTheImages) {  // E6
+TEST(EncoderNet, ImagesReachTheVoxelsAndVoxelsTheImages) {  // section 3.1
   torch::NoGradGuard no_grad;
   const EncoderConfig c = toyConfig();
   const auto net = makeNet(c, 7);
@@ -497,7 +499,7 @@ TEST(EncoderNet, ImagesReachTheVoxelsAndVoxelsTheImages) {  // E6
   EXPECT_GT(largestDifference(keyed, net->encode(in).mean), 1e-4);
 }
 
-TEST(EncoderNet, NormaliseGivesEveryTokensGroupsUnitDeviation) {  // E10
+TEST(EncoderNet, NormaliseGivesEveryTokensGroupsUnitDeviation) {  // section 3.3
   const EncoderConfig c = toyConfig();
   torch::manual_seed(8);
   const Tensor z = makeNet(c, 8)->normalise(3 + 2 * torch::randn({50, c.latent_dim}));
@@ -506,7 +508,7 @@ TEST(EncoderNet, NormaliseGivesEveryTokensGroupsUnitDeviation) {  // E10
   EXPECT_LT((groups.var(2, /*unbiased=*/false) - 1).abs().max().item<double>(), 1e-3);
 }
 
-TEST(EncoderNet, GaussiansStayNearTheirSubLattice) {  // E11
+TEST(EncoderNet, GaussiansStayNearTheirSubLattice) {  // section 3.5
   torch::NoGradGuard no_grad;
   for (int per_axis : {1, 2, 6}) {
     EncoderConfig c = toyConfig();
@@ -538,7 +540,7 @@ TEST(EncoderNet, GaussiansStayNearTheirSubLattice) {  // E11
   }
 }
 
-TEST(EncoderNet, AnyNumberOfGaussiansSharesTheLattice) {  // E11: M
+TEST(EncoderNet, AnyNumberOfGaussiansSharesTheLattice) {  // section 3.5: M
   for (int64_t m = 1; m <= 70; ++m) {
     const Tensor lattice = subLattice(m);
     ASSERT_EQ(lattice.sizes(), (std::vector<int64_t>{m, 3}));
@@ -576,7 +578,7 @@ TEST(EncoderNet, OctantsKeepTheirColours) {  // the way around the transformers
 
 // --- splitting ---------------------------------------------------------------------------------
 
-TEST(FalsePositives, HaveTheExactCountAndLieHalfNearTheTruth) {  // E9
+TEST(FalsePositives, HaveTheExactCountAndLieHalfNearTheTruth) {  // section 3.4
   std::vector<Coord> nodes;
   for (int i = 0; i < 300; ++i) nodes.push_back(Coord(i % 20, i / 20, i % 3 == 0));
   torch::Generator random = at::detail::createCPUGenerator(1);
@@ -611,7 +613,7 @@ TEST(FalsePositives, HaveTheExactCountAndLieHalfNearTheTruth) {  // E9
   }
 }
 
-TEST(FalsePositives, AreAllThatIsFreeWhereLessIsFreeThanWanted) {  // E9
+TEST(FalsePositives, AreAllThatIsFreeWhereLessIsFreeThanWanted) {  // section 3.4
   torch::Generator random = at::detail::createCPUGenerator(2);
   Tensor truth = torch::ones({4, 8}, torch::kBool);
   truth[1][3] = false, truth[2][5] = false;
@@ -633,7 +635,7 @@ class EncoderFile : public InFolder {
   Progress silent_;
 };
 
-TEST_F(EncoderFile, OneSetOfWeightsServesAnyNumberOfViews) {  // E1
+TEST_F(EncoderFile, OneSetOfWeightsServesAnyNumberOfViews) {  // section 2.1
   const Encoder encoder = encoderOf(toyConfig());
   for (size_t n : {1, 2, 4, 8, 12, 16}) {
     const std::vector<View> views = roomViews(n);
@@ -649,7 +651,7 @@ TEST_F(EncoderFile, OneSetOfWeightsServesAnyNumberOfViews) {  // E1
   }
 }
 
-TEST_F(EncoderFile, EncodesConditionAndTargetWithTheSameUnchangedWeights) {  // E14
+TEST_F(EncoderFile, EncodesConditionAndTargetWithTheSameUnchangedWeights) {  // section 3.8
   const Encoder encoder = encoderOf(toyConfig());
   const std::string hash = encoder.hash();
   const std::vector<View> few = roomViews(2), many = roomViews(6);
@@ -663,7 +665,7 @@ TEST_F(EncoderFile, EncodesConditionAndTargetWithTheSameUnchangedWeights) {  // 
   EXPECT_GT(dense.size(), first.size());
 }
 
-TEST_F(EncoderFile, LoadsExactlyWhatWasSaved) {  // E14
+TEST_F(EncoderFile, LoadsExactlyWhatWasSaved) {  // section 3.8
   const EncoderConfig c = toyConfig();
   const Encoder encoder = encoderOf(c);
   EXPECT_EQ(encoder.config().toJson(), c.toJson());
@@ -694,7 +696,7 @@ Place withGenerated(Place place) {
   return place;
 }
 
-TEST_F(EncoderFile, DecodesWhatWasSeenExactlyAndNothingIntoSeenAir) {  // E9, E11
+TEST_F(EncoderFile, DecodesWhatWasSeenExactlyAndNothingIntoSeenAir) {  // sections 3.4 and 3.5
   const std::vector<View> views = roomViews(3);
   for (int levels : {0, 1, 2})
     for (const float threshold : {.2f, .5f, 1.f}) {
@@ -740,7 +742,7 @@ TEST_F(EncoderFile, DecodesWhatWasSeenExactlyAndNothingIntoSeenAir) {  // E9, E1
     }
 }
 
-TEST_F(EncoderFile, LowerThresholdsKeepMore) {  // E9
+TEST_F(EncoderFile, LowerThresholdsKeepMore) {  // section 3.4
   const EncoderConfig c = toyConfig();
   const Encoder encoder = encoderOf(c);
   const std::vector<View> views = roomViews(2);
@@ -824,7 +826,7 @@ TEST(EncoderConfig, JsonRoundTripIsExact) {
     EXPECT_EQ(EncoderConfig::fromJson(c.toJson(), "test").toJson(), c.toJson());
 }
 
-TEST(EncoderConfig, PaperSizes) {  // E10, E11
+TEST(EncoderConfig, PaperSizes) {  // sections 3.3 and 3.5
   const EncoderConfig c = EncoderConfig::paper();
   EXPECT_EQ(c.gaussians_per_voxel, 216);
   EXPECT_EQ(c.latent_dim, 32);
@@ -930,7 +932,7 @@ TEST_F(TensorFiles, AFailedWriteThrowsAndLeavesNothing) {
 
 // --- training ----------------------------------------------------------------------------------
 
-TEST(Training, CosineRateIsItsFormula) {  // E13
+TEST(Training, CosineRateIsItsFormula) {  // section 3.7
   const auto rate = [](int64_t step) { return cosineRate(1e-3, step, 1100, 100, .02); };
   EXPECT_DOUBLE_EQ(rate(0), 1e-5);  // warm-up: linear, never zero
   EXPECT_DOUBLE_EQ(rate(49), 5e-4);
@@ -953,7 +955,7 @@ TEST(Training, AverageMovesByItsShareOfTheDifference) {
   EXPECT_TRUE(torch::allclose(average[0], torch::full({3}, 2.5f)));
 }
 
-TEST(Training, XavierBoundsMatricesAndZeroesBiases) {  // E13
+TEST(Training, XavierBoundsMatricesAndZeroesBiases) {  // section 3.7
   torch::manual_seed(13);
   Mlp mlp(300, 200, 100);
   initialiseXavier(mlp);
@@ -987,7 +989,7 @@ double firstLoss(EncoderConfig c, const std::vector<View>& views, float kl_weigh
   return encoderStepLoss(c, views, 14).first;
 }
 
-TEST(EncoderLoss, KlEqualsMonteCarlo) {  // E10, E12
+TEST(EncoderLoss, KlEqualsMonteCarlo) {  // sections 3.3 and 3.7
   torch::NoGradGuard no_grad;
   const EncoderConfig c = toyConfig();
   const std::vector<View> views = roomViews(2);
@@ -1009,7 +1011,7 @@ TEST(EncoderLoss, KlEqualsMonteCarlo) {  // E10, E12
   EXPECT_NEAR(kl, sum / kDraws, .01 * sum / kDraws);
 }
 
-TEST(EncoderLoss, ImageTermIsTheMeanOverObservedPixelsAndChannels) {  // E12
+TEST(EncoderLoss, ImageTermIsTheMeanOverObservedPixelsAndChannels) {  // section 3.7
   const EncoderConfig c = toyConfig(0);  // no splits: nothing else is random
   std::vector<View> views = roomViews(2);
   for (size_t i = 0; i < 900; ++i) views[1].depth[i] = 0;  // pixels that do not count
@@ -1038,7 +1040,7 @@ TEST(EncoderLoss, ImageTermIsTheMeanOverObservedPixelsAndChannels) {  // E12
   EXPECT_NEAR(firstLoss(c, views, 0, 0), sum / values, 1e-5 * sum / values);
 }
 
-TEST(EncoderLoss, SplitTermIsTheCrossEntropyOfWhatIsKnown) {  // E9, E12
+TEST(EncoderLoss, SplitTermIsTheCrossEntropyOfWhatIsKnown) {  // sections 3.4 and 3.7
   const EncoderConfig c = toyConfig(1);
   const std::vector<View> views = roomViews(2);
   const double split = firstLoss(c, views, 0, 1) - firstLoss(c, views, 0, 0);
@@ -1062,7 +1064,7 @@ TEST(EncoderLoss, SplitTermIsTheCrossEntropyOfWhatIsKnown) {  // E9, E12
   EXPECT_NEAR(split, sum / known, 1e-4 * sum / known);
 }
 
-TEST(EncoderTraining, AStepLowersTheLossAtEveryLevel) {  // E8, E13
+TEST(EncoderTraining, AStepLowersTheLossAtEveryLevel) {  // sections 2.3 and 3.7
   const std::vector<View> views = roomViews(2);
   for (int levels : {0, 1, 2}) {
     const auto [before, after] = encoderStepLoss(toyConfig(levels), views, 15);
@@ -1097,7 +1099,7 @@ TEST(EncoderTraining, MixedPrecisionIsCloseToFloatAndEndsWithItsScope) {
   EXPECT_TRUE(torch::equal(run().first, exact.first));
 }
 
-TEST(EncoderTraining, PaperPresetRunsAStep) {  // E11, E13: M = 216, width 512
+TEST(EncoderTraining, PaperPresetRunsAStep) {  // sections 3.5 and 3.7: M = 216, width 512
   const auto [before, after] = encoderStepLoss(EncoderConfig::paper(), {nearWall(32, .35f)}, 16);
   EXPECT_TRUE(std::isfinite(before));
   EXPECT_TRUE(std::isfinite(after));
@@ -1120,7 +1122,7 @@ std::vector<View> rotatedViews(uint64_t index) {
   return views;
 }
 
-TEST_F(EncoderResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // E13
+TEST_F(EncoderResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // section 3.7
   const EncoderConfig c = toyConfig();
   const SceneSource validation = [](uint64_t) { return roomViews(6); };
   TrainSettings settings;
@@ -1169,7 +1171,7 @@ std::vector<TrainLogRow> trainToy(TrainSettings settings, const std::string& fol
   return rows;
 }
 
-TEST_F(EncoderResume, ABatchesGradientIsTheMeanOfItsSamples) {  // E13
+TEST_F(EncoderResume, ABatchesGradientIsTheMeanOfItsSamples) {  // section 3.7
   auto net = std::make_shared<torch::nn::LinearImpl>(3, 1),
        average = std::make_shared<torch::nn::LinearImpl>(3, 1);
   TrainSettings settings;
@@ -1180,7 +1182,7 @@ TEST_F(EncoderResume, ABatchesGradientIsTheMeanOfItsSamples) {  // E13
   EXPECT_TRUE(torch::allclose(net->weight.grad(), ((x[0] + 2 * x[1]) / 2).unsqueeze(0)));
 }
 
-TEST_F(EncoderResume, TwoProcessesTrainAsOneWithTheirBatch) {  // E13, data parallel by Gloo
+TEST_F(EncoderResume, TwoProcessesTrainAsOneWithTheirBatch) {  // section 3.7, data parallel by Gloo
   const std::vector<TrainLogRow> alone = trainToy({}, path("one"));
   TrainSettings shared;
   shared.processes.size = 2, shared.processes.port = uint16_t(20000 + getpid() % 20000);

@@ -1,4 +1,5 @@
-// What the encoder is told of a scene, against loops over its pixels (spec E4, E5, E7).
+// What the encoder is told of a scene, against loops over its pixels (docs/method.md, sections 2
+// and 3; numbers behind tests are its sections).
 #include "encoder/observation.h"
 
 #include <gtest/gtest.h>
@@ -79,7 +80,7 @@ int patchOf(const Observation& o, const View& view, const Pixel& p) {
          p.x * l.columns / view.camera.width;
 }
 
-TEST(Observation, TokensAreTheVoxelsThatPointsFallInto) {  // E4
+TEST(Observation, TokensAreTheVoxelsThatPointsFallInto) {  // section 2.3
   const VoxelFrame frame = fittedFrame(roomViews(), .1f);
   const Observation o = observed(roomViews(), frame, 8);
   const std::vector<Coord> truth = voxelsOf(usablePixels(roomViews(), frame));
@@ -87,7 +88,7 @@ TEST(Observation, TokensAreTheVoxelsThatPointsFallInto) {  // E4
   EXPECT_EQ(sorted(o.tokens.coords(0)), truth);
 }
 
-TEST(Observation, SizesFollowTheTokensAndNotTheBounds) {  // E4: nothing dense
+TEST(Observation, SizesFollowTheTokensAndNotTheBounds) {  // section 2.3: nothing dense
   VoxelFrame frame = fittedFrame(roomViews(), .1f);
   const Observation tight = observed(roomViews(), frame, 8);
   frame.bounds.expand(1500);  // 3,000 voxels a side: 2.7e10 voxels
@@ -98,7 +99,7 @@ TEST(Observation, SizesFollowTheTokensAndNotTheBounds) {  // E4: nothing dense
   EXPECT_EQ(int64_t(wide.row_begin.size()), wide.tokens.size(1) + 1);
 }
 
-TEST(Observation, PatchCountsEqualThoseOfEveryPixel) {  // E7
+TEST(Observation, PatchCountsEqualThoseOfEveryPixel) {  // section 3.2
   const std::vector<View>& views = roomViews();
   const VoxelFrame frame = fittedFrame(views, .1f);
   for (int patches_across : {5, 8}) {  // 5 does not divide 64 pixels
@@ -116,7 +117,7 @@ TEST(Observation, PatchCountsEqualThoseOfEveryPixel) {  // E7
   }
 }
 
-TEST(Observation, LatticesFollowTheAspectAndNumberPatchesOn) {  // E5
+TEST(Observation, LatticesFollowTheAspectAndNumberPatchesOn) {  // section 2.6
   std::vector<View> views = {roomViews()[0], roomViews()[1]};
   views[1].camera = resized(views[1].camera, 32, 48);
   views[1].colour = resizeImage(views[1].colour, 32, 48);

@@ -29,7 +29,8 @@ std::vector<float> usableDepth(const DepthView& view, const CarveSettings& setti
 /// F and E exactly as if the ray of every usable pixel centre were traversed in double precision
 /// with openvdb::math::DDA from the camera to the voxel of its point; F wins over E. Voxel-driven:
 /// each candidate voxel is projected, a min/max depth pyramid decides most, the rest get exact
-/// ray-box tests. Parallel; the result does not depend on the number of threads. Spec A1.
+/// ray-box tests. Parallel; the result does not depend on the number of threads. See
+/// docs/method.md, section 2.4.
 SeenSpace carve(const VoxelFrame& frame, const std::vector<DepthView>& views,
                 const CarveSettings& settings, Progress& progress);
 

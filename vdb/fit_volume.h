@@ -22,8 +22,8 @@ struct VolumeSettings {
 /// horizontal surface normals), the box holds the seen points (0.5 % outliers trimmed at each side)
 /// and the cameras, grown by the margins; bounds are multiples of 4 voxels. The grid's origin is
 /// the world's. With `bounds`, the grid keeps the world's heading: a turned box would be larger
-/// than was asked for. Decision 2 of the design. Throws Error if no view has a usable depth or the
-/// volume would exceed 4,096 voxels a side.
+/// than was asked for. See docs/method.md, section 2.2. Throws Error if no view has a usable depth
+/// or the volume would exceed 4,096 voxels a side.
 VoxelFrame fitVolume(const std::vector<DepthView>& views, const VolumeSettings& settings,
                      const CarveSettings& carving);
 

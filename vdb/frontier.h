@@ -1,5 +1,6 @@
 #pragma once
-// Growth order: breadth-first levels over candidate tokens, by topology (paper sec. 4, spec A12).
+// Growth order: breadth-first levels over candidate tokens, by topology (paper sec. 4;
+// docs/method.md, section 4.8).
 #include <vector>
 
 #include "vdb/token_grid.h"

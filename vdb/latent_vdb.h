@@ -10,7 +10,7 @@ namespace vdbc {
 /// probability, bfs_level, generated, row; bool grids `filled` and `empty` of the voxels seen;
 /// metadata: latent_level, latent_dim, encoder_hash, growth, the frame (exactly), the volume,
 /// counts. All but z, which is rounded to half precision, reads back bit for bit, rows in their
-/// order. A checksum follows. Temporary name, then rename. docs/formats.md. Spec E10. Throws Error
+/// order. A checksum follows. Temporary name, then rename. docs/formats.md. Throws Error
 /// for arrays of different lengths, tokens outside the volume or twice the same, values that are
 /// not finite or too large for a half, and where the file cannot be written.
 void writeLatentVdb(const Place& place, const std::string& path);

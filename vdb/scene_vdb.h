@@ -31,12 +31,12 @@ struct SceneVoxels {
 
 /// Writes standard 5-4-3 grids: surface (level set), density (fog), Cd (vec3s), observed, generated
 /// (bool), probability, bfs_level (float), seen_empty (bool); world transform with the grid's
-/// rotation; metadata as formats.md 2.3. Voxel ijk's centre is at ijk + 0.5 in frame units: the
-/// file's transform has the half-voxel shift so that grid index space is cell-centred. `surface` is
-/// the exact distance to the boundary of the voxels; generated ones that lie in `empty` are left
-/// out of it. A checksum follows what OpenVDB reads. Written to a temporary name and renamed.
-/// Throws Error for voxels outside the bounds, twice the same, or with values that are not finite,
-/// and where the file cannot be written.
+/// rotation; metadata as docs/formats.md says. Voxel ijk's centre is at ijk + 0.5 in frame units:
+/// the file's transform has the half-voxel shift so that grid index space is cell-centred.
+/// `surface` is the exact distance to the boundary of the voxels; generated ones that lie in
+/// `empty` are left out of it. A checksum follows what OpenVDB reads. Written to a temporary name
+/// and renamed. Throws Error for voxels outside the bounds, twice the same, or with values that are
+/// not finite, and where the file cannot be written.
 void writeSceneVdb(const SceneVoxels& voxels, const std::string& path);
 
 /// Several completions of one place, each as its voxels: float grids `occupancy_mean` and

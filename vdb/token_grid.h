@@ -83,7 +83,7 @@ bool allVoxelsOn(const Mask& mask, const Coord& node, int level) {
 
 /// Rows of all tokens of a voxel topology and the maps between levels. Rows of each level are in
 /// tree iteration order, so the rows of a node's children are consecutive. Immutable after
-/// construction. Spec: E4, E8.
+/// construction. See docs/method.md, section 2.3.
 class TokenGrid {
  public:
   TokenGrid() = default;

@@ -1,5 +1,5 @@
 #!/bin/sh
-# The encoder-decoder's curves (docs/accuracy.md): a short training for each `run` line below, its time on a few held-out
+# The encoder-decoder's curves (docs/notes/accuracy.md): a short training for each `run` line below, its time on a few held-out
 # rooms, then charts. Can be stopped and started again: finished runs stay, a begun one goes on. One core, some three
 # minutes a run; the charts show what is there. The last part needs gnuplot.
 #   sh examples/lab/ablations.sh [FOLDER for runs and rooms, default out/ablations] [STEPS, default 400]

@@ -1,5 +1,5 @@
 #!/bin/sh
-# The completer's attention, block-sparse and full (docs/performance.md): a chunk of targets sees the nearest observed tokens;
+# The completer's attention, block-sparse and full (docs/notes/performance.md): a chunk of targets sees the nearest observed tokens;
 # here more and fewer of both, up to all of a scene. Held-out rooms, two views in, one thread; some minutes on a quiet
 # machine.
 #   sh examples/lab/attention.sh [ROOMS, default 65-72]

@@ -1,5 +1,5 @@
 #!/bin/sh
-# What the completer is worth without one of its parts (docs/accuracy.md): for each `run` line below the shipped weights are
+# What the completer is worth without one of its parts (docs/notes/accuracy.md): for each `run` line below the shipped weights are
 # trained some steps more without it, then judged by roll-outs on rooms that no network was trained on, two views in. Can be
 # stopped and started again: finished runs and judgements stay, a begun run goes on. One core, some three minutes a run and
 # two a judgement, and the rooms (320) to render once.

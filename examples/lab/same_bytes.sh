@@ -17,7 +17,7 @@ trap 'rm -rf "$made"' EXIT
   "$program" "$capture" --frames 0,6,12,18 -o "$made/capture.vdb" --threads "$threads" >"$made/log"
 rm "$made/log"
 (cd "$made" && sha256sum -- *) >"$made/files.sha256"
-"$lab" eval --scenes rooms:1-2 --views 2 --threads "$threads" 2>/dev/null |
+"$lab" eval --scenes rooms:1-2 --views 2 --threads "$threads" --json 2>/dev/null |
   sed -E 's/"(seconds|peak_rss_mb)":[^,}]*,?//g' >"$made/eval.jsonl"
 
 mkdir -p "$reference"

@@ -3,7 +3,7 @@
 # number of views (bars: standard error over the same rooms), the reliability of the stored probabilities, tau against the
 # number of views, and tables. Can be stopped and started again: finished parts stay; delete their .jsonl after the weights
 # have changed. One thread, well over an hour. The charts need gnuplot.
-#   sh examples/lab/study.sh [FOLDER, default docs: writes completion.svg, tau.svg, and in results/ completion.md,
+#   sh examples/lab/study.sh [FOLDER, default docs: writes completion.svg, tau.svg, and results/completion.md,
 #   completion.csv, reliability.csv, completion-*.jsonl]
 # ROOMS (1-16, with several tau), MORE_ROOMS (17-64) and HOMES (0-23, at two views) choose other scenes, VIEWS other numbers
 # of views. PARTS="rooms:1-16/2 ..." makes just those parts, so that several processes can share the work; CHARTS_ONLY=1

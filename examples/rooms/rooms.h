@@ -130,7 +130,7 @@ class RoomRenderer {
   std::unique_ptr<Impl> impl_;
 };
 
-/// Samples a pixel: 30 dB or more against 4,096 in most rooms at 224 x 224 (docs/rooms.md).
+/// Samples a pixel: 30 dB or more against 4,096 in most rooms at 224 x 224 (docs/notes/rooms.md).
 constexpr int kRoomSamples = 8;
 
 /// `count` cameras in a room, the covering ones of four times as many random ones, in random order:
