@@ -216,9 +216,9 @@ TEST(ClosingTokens, AnyScene) {
     Scene scene(CoordBBox(low, low + Coord(side() + 1, side(), side())));
     std::vector<Coord> nodes = nodesOf(scene.box);
     // Mostly closed to mostly open.
-    const unsigned open = random() % 5;
+    const unsigned open = unsigned(random() % 5);
     for (const Coord& c : nodes) {
-      const unsigned kind = random() % 10;
+      const unsigned kind = unsigned(random() % 10);
       scene[c] = kind < open ? kOpen : kind < 6 ? kWall : kind < 8 ? kSeen : kThere;
     }
     drop(&scene, nodes, 10, random);

@@ -586,7 +586,7 @@ TEST_F(CompleterFile, WhatIsFarFromAllThatWasSeenChangesNoBitAndCostsNothing) {
   const Place whole = completeIn(228, &wide);
   EXPECT_GT(whole.size(), sample_.condition.size());
   expectSame(completeIn(2388, &wider), whole);
-  EXPECT_EQ(wider.asked, wide.asked);
+  EXPECT_EQ(int(wider.asked), int(wide.asked));
 }
 
 TEST_F(CompleterFile, TheGateAsksFromWhatWasSeenOutwards) {

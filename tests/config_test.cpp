@@ -109,10 +109,11 @@ void expectFileOrDefault(const Config& config, const std::string& text) {
   EXPECT_FALSE(file.contains("extent_m")) << "weights from before some fields existed";
   for (const auto& [name, value] : found.items()) {
     const json& truth = file.contains(name) ? file[name] : defaults[name];
-    if (truth.is_number_float())
+    if (truth.is_number_float()) {
       EXPECT_EQ(value.template get<float>(), truth.get<float>()) << name;
-    else
+    } else {
       EXPECT_EQ(value, truth) << name;
+    }
   }
 }
 

@@ -101,7 +101,9 @@ TEST(SceneTokens, InABoxAreThoseThereAndUnobservedBeyond) {
     EXPECT_GT(inside, 0);
     EXPECT_LT(inside, int(in_box->box.volume()));
     for (auto node = whole->box.begin(); node; ++node)
-      if (!in_box->box.isInside(*node)) EXPECT_EQ(in_box->at(*node), NodeState::kUnobserved);
+      if (!in_box->box.isInside(*node)) {
+        EXPECT_EQ(in_box->at(*node), NodeState::kUnobserved);
+      }
   }
   EXPECT_EQ(part.coarse_filled, filledNodes(part.coarse));
   EXPECT_EQ(part.coarse_empty, emptyShell(part.coarse));
@@ -177,7 +179,8 @@ TEST(FineChunk, HoldsTheNearestOfEachKindAndTheGatesProbabilities) {
   EXPECT_EQ(chunk.tokens[kEmptyToken].coords, nearestOf(scene.empty_shell, centre, 5));
   EXPECT_EQ(chunk.tokens[kTarget].coords, targets);
   // The third target's parent was never asked.
-  EXPECT_TRUE(torch::equal(chunk.tokens[kTarget].features, torch::tensor({{.25f}, {.5f}, {0.f}})));
+  EXPECT_TRUE(
+      torch::equal(chunk.tokens[kTarget].features, torch::tensor({.25f, .5f, 0.f}).unsqueeze(1)));
 }
 
 TEST(CoarseStage, SeesAnEvenShareOfTheEmptyShellAndIsOneWhereThereIsNone) {

@@ -6,6 +6,7 @@
 #include <openvdb/tools/Prune.h>
 
 #include <algorithm>
+#include <cmath>
 #include <map>
 #include <random>
 #include <set>

@@ -4,8 +4,9 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <cmath>
+#include <map>
 #include <random>
-#include <set>
 
 namespace vdbc {
 namespace {
@@ -71,7 +72,7 @@ TEST(Windows, FramesAreCoresWithTheirSurroundingsInThePositionCodesExtent) {
           EXPECT_EQ(w.frame.bounds.max()[axis],
                     std::min(w.core.max()[axis] + overlap, frame.bounds.max()[axis]));
           // Cuts and overlaps move to coarse nodes, by at most one each.
-          EXPECT_LE(w.frame.bounds.dim()[axis] * frame.voxel_m,
+          EXPECT_LE(float(w.frame.bounds.dim()[axis]) * frame.voxel_m,
                     config.positions.extent_m + 12 * frame.voxel_m);
           if (frame.bounds.dim()[axis] * double(frame.voxel_m) <=
               double(config.positions.extent_m)) {
