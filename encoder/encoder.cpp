@@ -75,8 +75,8 @@ struct Children {
   std::vector<int32_t> node;  // row of the latent
 };
 
-// Writes Gaussians of the grid frame over those of `g` from `first` on, in the world's.
-void copyToWorld(const GaussianTensors& t, const VoxelFrame& frame, size_t first, Gaussians* g) {
+// Writes Gaussians of the grid frame over those of `g` from `first` on, turned to the world's axes.
+void copyTurned(const GaussianTensors& t, const VoxelFrame& frame, size_t first, Gaussians* g) {
   auto copy = [](const Tensor& from, void* to) {
     const Tensor c = from.contiguous();
     std::memcpy(to, c.data_ptr(), c.nbytes());
@@ -84,10 +84,10 @@ void copyToWorld(const GaussianTensors& t, const VoxelFrame& frame, size_t first
   copy(t.mean, &g->mean[first]), copy(t.log_scale, &g->log_scale[first]);
   copy(t.rotation, &g->rotation[first]), copy(t.opacity_logit, &g->opacity_logit[first]);
   copy(t.sh, &g->sh[3 * first]);
-  const Eigen::Isometry3f world_from_grid = frame.world_from_grid.cast<float>();
-  const Eigen::Quaternionf turn(world_from_grid.linear());
+  const Eigen::Matrix3f rotation = frame.world_from_grid.linear().cast<float>();
+  const Eigen::Quaternionf turn(rotation);
   for (size_t i = first; i < first + size_t(t.mean.size(0)); ++i) {
-    g->mean[i] = world_from_grid * g->mean[i];
+    g->mean[i] = rotation * g->mean[i];
     const Eigen::Vector4f q = g->rotation[i];
     const Eigen::Quaternionf r = (turn * Eigen::Quaternionf(q[0], q[1], q[2], q[3])).normalized();
     g->rotation[i] = {r.w(), r.x(), r.y(), r.z()};
@@ -156,12 +156,13 @@ DecodedGrid Encoder::decode(const Place& place, float child_threshold, Progress&
   const int64_t voxels = int64_t(coords.size()), m = c.gaussians_per_voxel;
   const Tensor all_coords = coordTensor(coords);
   out.gaussians.resize(voxels * m, 0);
+  out.gaussians.origin = place.frame.world_from_grid.translation();
   std::atomic<int64_t> done{0};
   inTasks((voxels + kPiece - 1) / kPiece, [&](int64_t piece) {
     const int64_t begin = piece * kPiece, end = std::min(voxels, begin + kPiece);
-    copyToWorld(impl_->net->gaussians(tokens.rows(begin, end), all_coords.slice(0, begin, end),
-                                      place.frame.voxel_m),
-                place.frame, size_t(begin * m), &out.gaussians);
+    copyTurned(impl_->net->gaussians(tokens.rows(begin, end), all_coords.slice(0, begin, end),
+                                     place.frame.voxel_m),
+               place.frame, size_t(begin * m), &out.gaussians);
     report(progress, int(100 * (done += end - begin) / voxels));
   });
   out.voxels = std::move(coords), out.node = std::move(node);

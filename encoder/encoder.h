@@ -16,7 +16,7 @@ struct DecodedGrid {
   std::vector<Coord> voxels;             // [V]
   std::vector<int32_t> node;             // [V] row of the latent it came from
   std::vector<float> child_probability;  // [V] of BCE-up; 1 where the voxel was observed
-  Gaussians gaussians;                   // [V * M] world frame, SH degree 0
+  Gaussians gaussians;                   // [V * M] from the grid's origin, SH degree 0
 };
 
 /// Trained networks, loaded once. Const functions may be called from several threads at once. They

@@ -4,6 +4,8 @@
 #include <cmath>
 #include <numeric>
 
+#include "vdb/z_order.h"
+
 namespace vdbc {
 
 namespace nn = torch::nn;
@@ -15,25 +17,12 @@ Tensor coordTensor(const std::vector<Coord>& coords) {
   return t;
 }
 
-namespace {
-// Spreads the low 21 bits of v so that two zero bits follow each.
-uint64_t spreadBits(uint64_t v) {
-  v &= 0x1fffff;
-  v = (v | v << 32) & 0x1f00000000ffffull;
-  v = (v | v << 16) & 0x1f0000ff0000ffull;
-  v = (v | v << 8) & 0x100f00f00f00f00full;
-  v = (v | v << 4) & 0x10c30c30c30c30c3ull;
-  return (v | v << 2) & 0x1249249249249249ull;
-}
-}  // namespace
-
 Tensor zOrder(const std::vector<Coord>& coords) {
   constexpr int kOffset = 1 << 20;  // makes negative coordinates positive
   std::vector<uint64_t> key(coords.size());
   for (size_t i = 0; i < coords.size(); ++i)
-    key[i] = spreadBits(uint64_t(coords[i].x() + kOffset)) << 2 |
-             spreadBits(uint64_t(coords[i].y() + kOffset)) << 1 |
-             spreadBits(uint64_t(coords[i].z() + kOffset));
+    key[i] = zOrderCode(uint64_t(coords[i].x() + kOffset), uint64_t(coords[i].y() + kOffset),
+                        uint64_t(coords[i].z() + kOffset));
   Tensor order = torch::empty({int64_t(coords.size())}, torch::kInt64);
   int64_t* o = order.data_ptr<int64_t>();
   std::iota(o, o + coords.size(), 0);

@@ -36,10 +36,10 @@ Eigen::AlignedBox3d bulk(const Gaussians& g) {
                    [&](const auto& m) { return m[axis]; });
     const auto low = values.begin() + std::ptrdiff_t(double(values.size() - 1) * kTrimmed);
     std::nth_element(values.begin(), low, values.end());
-    box.min()[axis] = double(*low);
+    box.min()[axis] = g.origin[axis] + double(*low);
     const auto high = values.begin() + std::ptrdiff_t(double(values.size() - 1) * (1 - kTrimmed));
     std::nth_element(values.begin(), high, values.end());
-    box.max()[axis] = double(*high);
+    box.max()[axis] = g.origin[axis] + double(*high);
   }
   return box;
 }

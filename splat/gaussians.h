@@ -10,10 +10,13 @@ namespace vdbc {
 
 constexpr float kSh0 = 0.28209479177387814f;  // colour (display sRGB) = 0.5 + kSh0 * sh[0]
 
-/// N anisotropic Gaussians; arrays are parallel. World frame of the input, metres.
+/// N anisotropic Gaussians; arrays are parallel. Axes and units of the input's world, metres.
 struct Gaussians {
+  /// Place in the world that means are measured from: single precision reaches a few kilometres,
+  /// and survey coordinates lie hundreds from their world's origin.
+  Eigen::Vector3d origin = Eigen::Vector3d::Zero();
   int sh_degree = 0;                       // 0..3
-  std::vector<Eigen::Vector3f> mean;       // [N] metres
+  std::vector<Eigen::Vector3f> mean;       // [N] metres from `origin`
   std::vector<Eigen::Vector3f> log_scale;  // [N] natural log of sigma, metres
   std::vector<Eigen::Vector4f> rotation;   // [N] quaternion w x y z; need not be normalised
   std::vector<float> opacity_logit;        // [N]
@@ -31,6 +34,11 @@ struct Gaussians {
                            column("sh", g.sh, size_t(g.shCoefficients()) * 3));
   }
 };
+
+/// Where a Gaussian is in the world, as near as single precision gets.
+inline Eigen::Vector3f worldMean(const Gaussians& g, size_t row) {
+  return (g.origin + g.mean[row].cast<double>()).cast<float>();
+}
 
 /// Throws Error unless all arrays have matching lengths and the SH degree is 0-3.
 void requireConsistent(const Gaussians& gaussians);

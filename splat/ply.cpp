@@ -7,6 +7,7 @@
 #include <charconv>
 #include <cmath>
 #include <cstring>
+#include <limits>
 #include <sstream>
 
 #include "splat/gaussian_files.h"
@@ -215,7 +216,8 @@ void writePly(const Gaussians& g, const std::string& path, const Eigen::Vector3f
     const size_t row = size_t(rows[i]);
     std::array<float, 62> values{};
     float* to = values.data();
-    for (int k = 0; k < 3; ++k) *to++ = g.mean[row][k];
+    const Eigen::Vector3f p = worldMean(g, row);
+    for (int k = 0; k < 3; ++k) *to++ = p[k];
     to += 3;  // normals stay 0
     const float* sh = g.sh.data() + row * coefficients * 3;
     for (size_t c = 0; c < 3; ++c) *to++ = sh[c];
@@ -230,6 +232,16 @@ void writePly(const Gaussians& g, const std::string& path, const Eigen::Vector3f
                 row_floats * sizeof(float));
   });
   writeFile("writePly", path, bytes.data(), bytes.size());
+}
+
+double plyStep(const Gaussians& g) {
+  float farthest = 0;
+  for (size_t i = 0; i < size_t(g.size()); ++i) {
+    const float far = worldMean(g, i).cwiseAbs().maxCoeff();
+    if (std::isfinite(far)) farthest = std::max(farthest, far);
+  }
+  return double(std::nextafter(farthest, std::numeric_limits<float>::infinity())) -
+         double(farthest);
 }
 
 Gaussians readPly(const std::string& path) {

@@ -14,6 +14,10 @@ namespace vdbc {
 void writePly(const Gaussians& gaussians, const std::string& path,
               const Eigen::Vector3f& up = Eigen::Vector3f::Zero());
 
+/// The step (metres) between the single-precision numbers by which a PLY says where these Gaussians
+/// are, at the farthest from the world's origin.
+double plyStep(const Gaussians& gaussians);
+
 /// Reads INRIA-like PLY by any conforming writer: any property order, normals and f_rest optional.
 /// Gaussians with NaN or Inf are dropped, quaternions stay as they are. Comments `SplatRenderMode:
 /// mip` and `antialiased 1` make them antialiased. Throws Error on anything else: truncated, no

@@ -235,7 +235,7 @@ void readShapes(const SplatLeaf& source, const openvdb::math::Transform& transfo
     for (openvdb::Index n = begin; n < end; ++n) {
       const size_t row = source.first_row + n;
       const openvdb::Vec3d p = transform.indexToWorld(voxel + openvdb::Vec3d(position.get(n)));
-      g->mean[row] = Eigen::Vector3d(p.x(), p.y(), p.z()).cast<float>();
+      g->mean[row] = (Eigen::Vector3d(p.x(), p.y(), p.z()) - g->origin).cast<float>();
       const Vec3f sigma = scale.get(n);
       g->log_scale[row] = {std::log(sigma.x()), std::log(sigma.y()), std::log(sigma.z())};
       const Quats q = orient.get(n);
@@ -296,6 +296,17 @@ PointGrid::Ptr findSplats(const openvdb::GridPtrVec& grids, const std::string& p
   return chosen;
 }
 
+/// Where means are measured from: the grid's own origin as we write it, or, in files that keep
+/// their points far from it, the first of their voxels.
+Eigen::Vector3d originOf(const PointGrid& grid, const std::vector<SplatLeaf>& leaves) {
+  constexpr double kFar = 10000;  // metres: 1 mm in single precision
+  if (leaves.empty()) return Eigen::Vector3d::Zero();
+  const openvdb::Vec3d grid_origin = grid.transform().indexToWorld(openvdb::Vec3d(0)),
+                       first = grid.transform().indexToWorld(leaves[0].leaf->origin());
+  const openvdb::Vec3d near = (first - grid_origin).length() < kFar ? grid_origin : first;
+  return {near.x(), near.y(), near.z()};
+}
+
 Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenance* provenance) {
   std::vector<SplatLeaf> leaves;
   size_t count = 0;
@@ -339,6 +350,7 @@ Gaussians gatherPoints(const PointGrid& grid, const std::string& path, Provenanc
     provenance->generated.assign(count, 0);
     provenance->probability.assign(count, 1.f);
   }
+  g.origin = originOf(grid, leaves);
   tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {
     readShapes(leaves[i], grid.transform(), &g);
     readColours(leaves[i], has_sh, &g);
@@ -372,6 +384,7 @@ void writePointsVdb(const Gaussians& g, const Provenance& provenance, const std:
     const auto transform =
         openvdb::math::Transform::createLinearTransform(pointsVoxelSize(g, rows));
     grid = PointGrid::create(buildPointTree(g, provenance, rows, *transform));
+    transform->postTranslate(openvdb::Vec3d(g.origin.x(), g.origin.y(), g.origin.z()));
     grid->setTransform(transform);
     grid->setName("splats");
     grid->setCreator("vdb_complete");

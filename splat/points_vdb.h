@@ -27,7 +27,8 @@ struct Provenance {
 /// Cd scene-linear half, GS_SPH_R/G/B half[(degree + 1)^2] (not for degree 0: Cd is all its
 /// colour), `probability`, group `completed` (generated ones). Metadata: counts, `sh_degree`,
 /// `splat_render_mode` (`mip` if antialiased, or `default`). Voxel size is chosen for about 8
-/// points a voxel. Points are sorted by voxel, so the order of Gaussians is not kept. Empty
+/// points a voxel. The grid's transform places its origin at the Gaussians' own, in double
+/// precision. Points are sorted by voxel, so the order of Gaussians is not kept. Empty
 /// provenance means observed, 1. Drops and normalises as writePly() does. Temporary name, then
 /// rename. Throws Error.
 void writePointsVdb(const Gaussians& gaussians, const Provenance& provenance,
@@ -35,7 +36,8 @@ void writePointsVdb(const Gaussians& gaussians, const Provenance& provenance,
 
 /// Reads the points grid `splats` (or else the first points grid) with attributes P, scale, orient,
 /// GS_Alpha and GS_SPH_R/G/B (or Cd alone); `provenance` defaults to observed, 1 where the file has
-/// none. Throws Error on other points, other grids, corrupt files.
+/// none. Their origin is the grid's, or the first voxel where that is farther than 10 km. Throws
+/// Error on other points, other grids, corrupt files.
 Gaussians readPointsVdb(const std::string& path, Provenance* provenance = nullptr);
 
 }  // namespace vdbc

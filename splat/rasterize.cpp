@@ -215,7 +215,8 @@ const RasterKernels& kernelsOf(int bits) {
 }
 #endif
 
-RasterView viewOf(const Camera& camera, const RasterSettings& settings) {
+RasterView viewOf(const Camera& camera, const Eigen::Vector3d& origin,
+                  const RasterSettings& settings) {
   require(camera.width > 0 && camera.height > 0 && camera.width <= 32768 && camera.height <= 32768,
           "rasterize: expected an image of 1 to 32768 pixels a side, found ", camera.width, " x ",
           camera.height);
@@ -235,7 +236,7 @@ RasterView viewOf(const Camera& camera, const RasterSettings& settings) {
   const Eigen::Matrix3d world_from_camera = camera.world_from_camera.linear();
   for (int r = 0; r < 3; ++r)
     for (int c = 0; c < 3; ++c) v.camera_from_world[3 * r + c] = float(world_from_camera(c, r));
-  const Eigen::Vector3d eye = camera.world_from_camera.translation();
+  const Eigen::Vector3d eye = camera.world_from_camera.translation() - origin;
   for (int j = 0; j < 3; ++j) {
     v.eye[j] = float(eye[j]);
     v.eye_rest[j] = float(eye[j] - double(v.eye[j]));
@@ -423,7 +424,7 @@ RasterOutput rasterize(const Gaussians& gaussians, const Camera& camera,
   require(gaussians.size() < int64_t(1) << 30,
           "rasterize: expected fewer than 2^30 Gaussians, found ", gaussians.size());
   RasterStatePtr state(new RasterState);
-  state->view = viewOf(camera, settings);
+  state->view = viewOf(camera, gaussians.origin, settings);
   state->kernels = &kernelsOf(settings.vector_bits);
   state->gaussians = gaussians.size();
   state->sh_degree = gaussians.sh_degree;

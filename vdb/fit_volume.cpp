@@ -128,28 +128,19 @@ Eigen::AlignedBox3d trimmedBox(const std::vector<ViewSamples>& samples, const Ma
   return box;
 }
 
-/// The smallest box of coarse nodes that holds `box` (metres, grid frame).
-CoordBBox voxelBounds(const Eigen::AlignedBox3d& box, double voxel_m) {
+/// Voxels from 0 on, whole coarse nodes, that reach over `size` metres.
+CoordBBox voxelBounds(const Vector3d& size, double voxel_m) {
   // A box that ends on a voxel's face ends there: the division must not add a node.
   constexpr double kSlack = 1e-4;  // voxels
-  CoordBBox bounds;
+  CoordBBox bounds(Coord(0), Coord(0));
   for (int axis = 0; axis < 3; ++axis) {
-    const double low = (box.min()[axis] / voxel_m + kSlack) / kCoarseVoxels;
-    const double high = (box.max()[axis] / voxel_m - kSlack) / kCoarseVoxels;
-    require(std::abs(low) < kMaxVolumeIndex / kCoarseVoxels &&
-                std::abs(high) < kMaxVolumeIndex / kCoarseVoxels,
-            "fitVolume: the scene lies too far from the origin for voxels of ", voxel_m,
-            " m (expected coordinates below ", kMaxVolumeIndex * voxel_m, " m, found ",
-            box.min()[axis], " to ", box.max()[axis], " m)");
-    bounds.min()[axis] = int(std::floor(low)) * kCoarseVoxels;
-    bounds.max()[axis] =
-        std::max(int(std::ceil(high)) * kCoarseVoxels, bounds.min()[axis] + kCoarseVoxels) - 1;
+    const double nodes = std::ceil((size[axis] / voxel_m - kSlack) / kCoarseVoxels);
+    require(nodes * kCoarseVoxels <= kMaxVolumeSide, "fitVolume: the volume is too large (",
+            size.x(), " x ", size.y(), " x ", size.z(), " m in voxels of ", voxel_m,
+            " m, expected at most ", kMaxVolumeSide,
+            " a side): take a larger voxel or give bounds");
+    bounds.max()[axis] = std::max(int(nodes), 1) * kCoarseVoxels - 1;
   }
-  const Coord dim = bounds.dim();
-  require(std::max({dim.x(), dim.y(), dim.z()}) <= kMaxVolumeSide,
-          "fitVolume: the volume is too large (", dim.x(), " x ", dim.y(), " x ", dim.z(),
-          " voxels of ", voxel_m, " m, expected at most ", kMaxVolumeSide,
-          " a side): take a larger voxel or give bounds");
   return bounds;
 }
 
@@ -194,12 +185,20 @@ VoxelFrame fitVolume(const std::vector<DepthView>& views, const VolumeSettings& 
     box = trimmedBox(samples, axes);
     for (const DepthView& view : views)
       box.extend(axes.transpose() * view.camera.world_from_camera.translation());
+    // A margin of whole voxels and a half: what bounds the place lies amid voxels, not on their
+    // faces, where noise would tear it in two.
     const Vector3d margin(settings.margin_m, settings.margin_m, settings.vertical_margin_m);
-    box.min() -= margin;
+    const double voxel_m = double(settings.voxel_m);
+    box.min() -= Vector3d((margin / voxel_m).array().ceil() + .5) * voxel_m;
     box.max() += margin;
   }
   frame.world_from_grid.linear() = axes;
-  frame.bounds = voxelBounds(box, double(settings.voxel_m));
+  require(
+      box.min().cwiseAbs().maxCoeff() < kMaxWorldM && box.max().cwiseAbs().maxCoeff() < kMaxWorldM,
+      "fitVolume: the scene lies too far from the world's origin (expected coordinates below ",
+      kMaxWorldM, " m, found ", box.min().transpose(), " to ", box.max().transpose(), " m)");
+  frame.world_from_grid.translation() = axes * box.min();
+  frame.bounds = voxelBounds(box.sizes(), double(settings.voxel_m));
   return frame;
 }
 

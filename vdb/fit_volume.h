@@ -21,9 +21,10 @@ struct VolumeSettings {
 /// The volume of a scene: z of the grid is up, yaw follows the walls (strongest direction of the
 /// horizontal surface normals), the box holds the seen points (0.5 % outliers trimmed at each side)
 /// and the cameras, grown by the margins; bounds are multiples of 4 voxels. The grid's origin is
-/// the world's. With `bounds`, the grid keeps the world's heading: a turned box would be larger
-/// than was asked for. See docs/method.md, section 2.2. Throws Error if no view has a usable depth
-/// or the volume would exceed 4,096 voxels a side.
+/// the box's lowest corner, so that the same place gives the same voxels wherever in the world it
+/// lies. With `bounds`, the grid keeps the world's heading: a turned box would be larger than was
+/// asked for. See docs/method.md, section 2.2. Throws Error if no view has a usable depth, or the
+/// volume would exceed kMaxVolumeSide voxels a side or lie beyond kMaxWorldM.
 VoxelFrame fitVolume(const std::vector<DepthView>& views, const VolumeSettings& settings,
                      const CarveSettings& carving);
 

@@ -10,10 +10,14 @@ using openvdb::Coord;
 using openvdb::CoordBBox;
 
 constexpr int kMaxVolumeSide = 4096;  // voxels
-constexpr int kMaxVolumeIndex =
-    1 << 28;  // voxels; far inside int32, so sums of coordinates are too
+/// The limit on coordinates, voxels: far inside int32, so that sums of coordinates are too. Grids
+/// of ours start at their volume; this is what other people's may hold.
+constexpr int kMaxVolumeIndex = 1 << 28;
+/// The limit on places in the world, metres: double precision keeps a hundredth of a millimetre.
+constexpr double kMaxWorldM = 1e10;
 
-/// A box of voxels and its place in the world.
+/// A box of voxels and its place in the world. Grids that are fitted to views start at their
+/// volume, wherever in the world it is: all that is computed in the grid's own terms is near 0.
 /// world = origin + rotation * (ijk * voxel_m); voxel ijk covers [ijk, ijk + 1) (corner-based).
 struct VoxelFrame {
   float voxel_m = 0.1f;                                               // voxel edge, metres

@@ -314,7 +314,7 @@ double sceneLeak(const EvaluationScene& scene, const VoxelFrame& frame,
 
 void addIsotropic(const Eigen::Vector3d& mean, double sigma_m, const Eigen::Vector3f& srgb,
                   Gaussians* g) {
-  g->mean.push_back(mean.cast<float>());
+  g->mean.push_back((mean - g->origin).cast<float>());
   g->log_scale.push_back(Eigen::Vector3f::Constant(float(std::log(sigma_m))));
   g->rotation.emplace_back(1, 0, 0, 0);
   g->opacity_logit.push_back(5);  // .993; the rasteriser stops at .99
