@@ -9,6 +9,7 @@
 #include "houdini_style_tools/options.h"
 #include "houdini_style_tools/report.h"
 #include "houdini_style_tools/verbs.h"
+#include "splat/ply.h"
 #include "vdb/mask_vdb.h"
 #include "vdb/process.h"
 
@@ -144,6 +145,8 @@ Made cookSample(const SceneInput& in, Place start, const Encoder& encoder,
   });
 }
 
+constexpr double kFinePlyStep = .001;  // metres
+
 ordered_json summaryOf(const SceneInput& in, const Made& made) {
   const auto& generated = made.place.generated;
   const auto observed = std::count(generated.begin(), generated.end(), uint8_t(0));
@@ -151,7 +154,8 @@ ordered_json summaryOf(const SceneInput& in, const Made& made) {
           {"observed_tokens", observed},
           {"generated_tokens", made.place.size() - observed},
           {"voxels", made.decoded.voxels.size()},
-          {"gaussians", made.decoded.gaussians.size()}};
+          {"gaussians", made.decoded.gaussians.size()},
+          {"ply_step_m", plyStep(made.decoded.gaussians)}};
 }
 
 void printCompletion(const Run& run, const CompleteOptions& o, const std::string& stem,
@@ -164,6 +168,9 @@ void printCompletion(const Run& run, const CompleteOptions& o, const std::string
                made["gaussians"], " Gaussians; ", std::round(seconds * 10) / 10, " s\n", stem,
                ".vdb  ", stem, ".points.vdb  ", stem, ".ply  ", stem, kLatentEnding);
   if (!o.fromLatents()) text += joinText("  ", stem, kPictureEnding);
+  if (made["ply_step_m"] > kFinePlyStep)
+    text += joinText("\n", stem, ".ply: its numbers have steps of ", made["ply_step_m"],
+                     " m so far from the world's origin; ", stem, ".points.vdb has none");
   if (o.samples > 1)
     text +=
         joinText("\nthe same of ", o.samples - 1, " more with other seeds: ", sampleStem(stem, 2),

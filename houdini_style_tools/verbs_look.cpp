@@ -48,8 +48,13 @@ struct CheckOptions {
 };
 
 void cookCheck(const CheckOptions& o, const Run& run) {
-  const std::vector<View> views = readViews(o.views, o.reading);
-  const SceneVoxels voxels = readSceneVdb(o.volume);
+  std::vector<View> views = readViews(o.views, o.reading);
+  SceneVoxels voxels = readSceneVdb(o.volume);
+  // Rays are traced in single precision: near the grid's origin, not the world's.
+  for (View& v : views)
+    v.camera.world_from_camera =
+        voxels.frame.world_from_grid.inverse() * v.camera.world_from_camera;
+  voxels.frame.world_from_grid.setIdentity();
   const RayTarget target = RayTarget::fromVoxels(voxels.frame, voxels.ijk);
   const DepthAgreement a = depthAgreement(target, views, 2 * voxels.frame.voxel_m);
   std::vector<Eigen::Vector3f> origins;
