@@ -40,7 +40,7 @@ for rooms in 1 2 3 4 5 6 7 8; do
   job rooms $rooms "$home" --frames 0-$last --bounds $bounds
   last=$((last + 3))
 done
-compare "$jobs" --scores seconds peak_mb observed_tokens generated_tokens --csv "$results/scaling.csv"
+compare "$jobs" --method '' --scores seconds peak_mb observed_tokens generated_tokens --csv "$results/scaling.csv"
 cd "$results"
 gnuplot <<'PLOT'
 set terminal svg size 900,380 font "sans,13" background "white"
