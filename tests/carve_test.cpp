@@ -182,7 +182,7 @@ TEST(Carve, TraversalMatchesClosedForm) {
     }
     CarveSettings settings;
     settings.flying_pixel_ratio = 0;
-    const VoxelFrame frame = roomFrame(0.23f + 0.05f * round, 0.3 * round);
+    const VoxelFrame frame = roomFrame(0.23f + 0.05f * float(round), 0.3 * round);
     const ClosedForm truth = closedForm(frame, views, settings);
     const SeenSpace space = carveByTraversal(frame, borrow(views), settings);
     EXPECT_EQ(voxelSet(space.filled), truth.filled);

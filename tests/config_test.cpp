@@ -37,13 +37,13 @@ TYPED_TEST(WeightsConfig, EveryFieldIsReadAndOthersKeepTheirDefaults) {
   for (const auto& [name, value] : defaults.items()) {
     json changed;
     if (value.is_boolean())
-      changed = !value.get<bool>();
+      changed = !value.template get<bool>();
     else if (value.is_string())
       changed = "another";
     else if (value.is_number_float())
-      changed = value.get<float>() / 2 + .125f;
+      changed = value.template get<float>() / 2 + .125f;
     else
-      changed = 2 * value.get<int>();
+      changed = 2 * value.template get<int>();
     json truth = defaults;
     truth[name] = changed;
     EXPECT_NE(truth, defaults) << name;

@@ -20,6 +20,7 @@
 #include "tests/vdb_files.h"
 #include "vdb/fit_volume.h"
 #include "vdb/grid_instances.h"
+#include "vdb/scene_vdb.h"
 
 namespace vdbc {
 namespace {
