@@ -1079,7 +1079,7 @@ TEST(EncoderTraining, MixedPrecisionIsCloseToFloatAndEndsWithItsScope) {
   const Tensor x = torch::randn({40, 32});
   const auto run = [&] {
     block.zero_grad();
-    const Tensor y = block.forward(x, nullptr, torch::arange(40), 64, false);
+    const Tensor y = block.forward(x, nullptr);
     y.square().mean().backward();
     return std::pair(y.detach().clone(), block.mlp->first->weight.grad().clone());
   };

@@ -8,6 +8,8 @@
 #include <map>
 #include <random>
 
+#include "vdb/token_grid.h"
+
 namespace vdbc {
 namespace {
 
