@@ -41,7 +41,7 @@ TYPED_TEST(WeightsConfig, EveryFieldIsReadAndOthersKeepTheirDefaults) {
     else if (value.is_string())
       changed = "another";
     else if (value.is_number_float())
-      changed = value.template get<float>() / 2 + .125f;
+      changed = value.template get<float>() / 2 + .0625f;
     else
       changed = 2 * value.template get<int>();
     json truth = defaults;
@@ -68,7 +68,8 @@ TYPED_TEST(WeightsConfig, RefusesWhatItDoesNotKnow) {
   }
   for (const char* text : {"", "not JSON", "{", "[]", "null", "3", "\"small\"", "[{}]"})
     rejected(text);
-  for (const auto& [name, value] : fieldsOf(TypeParam()).items()) {
+  const json fields = fieldsOf(TypeParam());
+  for (const auto& [name, value] : fields.items()) {
     rejected(json{{name, json::array({1})}}.dump());
     rejected(json{{name, value.is_string() ? json(1) : json("1")}}.dump());
   }

@@ -735,7 +735,8 @@ TEST_F(EncoderFile, DecodesWhatWasSeenExactlyAndNothingIntoSeenAir) {  // sectio
       EXPECT_EQ(d.gaussians.size(), int64_t(d.voxels.size()) * 8) << "M = 2^3 a voxel";
       for (int64_t i = 0; i < d.gaussians.size(); ++i) {
         ASSERT_NEAR(d.gaussians.rotation[size_t(i)].norm(), 1, 1e-5);
-        const Eigen::Vector3d p = o.frame.toIndex(d.gaussians.mean[size_t(i)].cast<double>());
+        const Eigen::Vector3d p =
+            o.frame.toIndex(d.gaussians.origin + d.gaussians.mean[size_t(i)].cast<double>());
         const Coord v = d.voxels[size_t(i / 8)];
         for (int a = 0; a < 3; ++a) ASSERT_LT(std::abs(p[a] - (v[a] + .5)), .25 + .75 + 1e-3);
       }

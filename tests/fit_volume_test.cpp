@@ -223,7 +223,7 @@ TEST(FitVolume, WallsLieAmidVoxels) {
   const VoxelFrame frame = fitVolume(capture.views(), {}, {});
   const Vector3d corner = frame.toIndex(Vector3d(-2 + 0.123, -1.5 + 4.567, 0 + 8.9));
   for (int axis = 0; axis < 3; ++axis)
-    EXPECT_NEAR(corner[axis] - std::floor(corner[axis]), .5, .1) << axis;
+    EXPECT_NEAR(corner[axis] - std::floor(corner[axis]), .25, .1) << axis;
 }
 
 TEST(FitVolume, InverseTransformIsExact) {

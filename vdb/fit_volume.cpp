@@ -185,11 +185,11 @@ VoxelFrame fitVolume(const std::vector<DepthView>& views, const VolumeSettings& 
     box = trimmedBox(samples, axes);
     for (const DepthView& view : views)
       box.extend(axes.transpose() * view.camera.world_from_camera.translation());
-    // A margin of whole voxels and a half: what bounds the place lies amid voxels, not on their
-    // faces, where noise would tear it in two.
+    // A margin of whole voxels and a quarter: what bounds the place lies amid voxels and amid their
+    // octants, not on faces, where rounding and noise would tear it in two.
     const Vector3d margin(settings.margin_m, settings.margin_m, settings.vertical_margin_m);
     const double voxel_m = double(settings.voxel_m);
-    box.min() -= Vector3d((margin / voxel_m).array().ceil() + .5) * voxel_m;
+    box.min() -= Vector3d((margin / voxel_m).array().ceil() + .25) * voxel_m;
     box.max() += margin;
   }
   frame.world_from_grid.linear() = axes;
