@@ -79,7 +79,7 @@ Rows rowsOf(const SceneVoxels& v) {
 }
 
 void fill(int64_t rows, Counter next, Gaussians* g) {
-  g->sh_degree = 1, g->antialias = true;
+  g->origin = {4.5e5, -3, 1e-9}, g->sh_degree = 1, g->antialias = true;
   for (int64_t i = 0; i < rows; ++i) {
     g->mean.emplace_back(next.real(), next.real(), next.real());
     g->log_scale.emplace_back(next.real(), next.real(), next.real());
@@ -88,7 +88,7 @@ void fill(int64_t rows, Counter next, Gaussians* g) {
     for (int c = 0; c < 12; ++c) g->sh.push_back(next.real());
   }
 }
-auto besidesRows(const Gaussians& g) { return std::make_tuple(g.sh_degree, g.antialias); }
+auto besidesRows(const Gaussians& g) { return std::make_tuple(g.origin, g.sh_degree, g.antialias); }
 Rows rowsOf(const Gaussians& g) {
   Rows rows;
   for (size_t i = 0; i < g.mean.size(); ++i) {

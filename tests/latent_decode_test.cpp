@@ -46,6 +46,7 @@ TEST(LatentDecode, FromTheFileIsFromMemoryByteForByte) {
   EXPECT_EQ(later.voxels, at_once.voxels);
   EXPECT_EQ(later.node, at_once.node);
   EXPECT_TRUE(sameBytes(later.child_probability, at_once.child_probability));
+  EXPECT_EQ(later.gaussians.origin, at_once.gaussians.origin);
   EXPECT_TRUE(sameBytes(later.gaussians.mean, at_once.gaussians.mean));
   EXPECT_TRUE(sameBytes(later.gaussians.log_scale, at_once.gaussians.log_scale));
   EXPECT_TRUE(sameBytes(later.gaussians.rotation, at_once.gaussians.rotation));
