@@ -23,6 +23,9 @@ void appendBytes(const std::vector<T>& values, std::string* bytes) {
 std::string hashOf(const Place& place) {
   std::string bytes;
   appendBytes(std::vector<Coord>{place.frame.bounds.min(), place.frame.bounds.max()}, &bytes);
+  // Grids start at their volume: where in the world that is, no coordinate of a token tells.
+  const Eigen::Matrix4d& world_from_grid = place.frame.world_from_grid.matrix();
+  appendBytes(std::vector<double>(world_from_grid.data(), world_from_grid.data() + 16), &bytes);
   forEachColumn([&](const auto& c) { appendBytes(c.values, &bytes); }, place);
   return hexOf(fnv1a(bytes.data(), bytes.size()));
 }

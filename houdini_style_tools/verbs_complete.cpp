@@ -73,9 +73,7 @@ std::shared_ptr<const TokenMask> allowedTokens(const CompleteOptions& o, const V
   if (o.region.empty() && o.lock.empty()) return nullptr;
   auto allowed = std::make_shared<TokenMask>();
   if (o.region.empty())
-    allowed->sparseFill(
-        CoordBBox(tokenCoord(frame.bounds.min(), 1), tokenCoord(frame.bounds.max(), 1)), true,
-        true);
+    allowed->sparseFill(nodesIn(frame.bounds, 1), true, true);
   else
     allowed->topologyUnion(readTokenMask(o.region, frame, 1));
   allowed->topologyDifference(locked);

@@ -333,5 +333,14 @@ TEST(Identity, EveryOptionChangesIt) {
   EXPECT_TRUE(identities.insert(completionIdentity(completer, start, settings)).second);
 }
 
+TEST(Identity, SaysWhereInTheWorldThePlaceIs) {  // tokens count from the volume's own corner
+  const std::string weights = VDBC_SOURCE_DIR "/weights/small/completer.safetensors";
+  if (!std::filesystem::exists(weights)) GTEST_SKIP() << "no trained weights";
+  const Completer completer(weights);
+  Place here, there;
+  there.frame.world_from_grid.translation().x() = 1;
+  EXPECT_NE(completionIdentity(completer, here, {}), completionIdentity(completer, there, {}));
+}
+
 }  // namespace
 }  // namespace vdbc

@@ -47,8 +47,7 @@ void forEachAttribute(PlaceType& place, const Visit& visit) {
 
 /// Throws unless every token makes sense; for writer and reader.
 void requireTokens(const char* operation, const Place& g, const std::string& path) {
-  const CoordBBox nodes(tokenCoord(g.frame.bounds.min(), g.level),
-                        tokenCoord(g.frame.bounds.max(), g.level));
+  const CoordBBox nodes = nodesIn(g.frame.bounds, g.level);
   for (size_t i = 0; i < g.ijk.size(); ++i) {
     require(nodes.isInside(g.ijk[i]), operation, ": ", path, ": node ", g.ijk[i],
             " lies outside the volume ", nodes);

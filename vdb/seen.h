@@ -11,6 +11,14 @@ namespace vdbc {
 
 enum class NodeState : uint8_t { kUnobserved = 0, kEmpty = 1, kFilled = 2 };
 
+/// Of a node, by the topologies of what was filled and seen empty: trees or accessors.
+template <typename Mask>
+NodeState stateOf(const Mask& filled, const Mask& empty, const Coord& node) {
+  return filled.isValueOn(node)  ? NodeState::kFilled
+         : empty.isValueOn(node) ? NodeState::kEmpty
+                                 : NodeState::kUnobserved;
+}
+
 /// What was seen of a box of nodes of one tree level. Memory follows what was seen: U is what is in
 /// neither topology, however large the box.
 struct SeenSpace {
@@ -20,22 +28,14 @@ struct SeenSpace {
   TokenMask empty;   // E: not F, and all of it was passed by rays before they hit; pruned to tiles
 
   /// U outside the box. Safe to call from several threads; StateLookup is faster.
-  NodeState at(const Coord& node) const {
-    return filled.isValueOn(node)  ? NodeState::kFilled
-           : empty.isValueOn(node) ? NodeState::kEmpty
-                                   : NodeState::kUnobserved;
-  }
+  NodeState at(const Coord& node) const { return stateOf(filled, empty, node); }
 };
 
 /// SeenSpace::at() for many neighbouring nodes; one a thread. The space has to outlive it.
 class StateLookup {
  public:
   explicit StateLookup(const SeenSpace& space) : filled_(space.filled), empty_(space.empty) {}
-  NodeState operator()(const Coord& node) const {
-    return filled_.isValueOn(node)  ? NodeState::kFilled
-           : empty_.isValueOn(node) ? NodeState::kEmpty
-                                    : NodeState::kUnobserved;
-  }
+  NodeState operator()(const Coord& node) const { return stateOf(filled_, empty_, node); }
 
  private:
   openvdb::tree::ValueAccessor<const TokenMask> filled_, empty_;

@@ -24,10 +24,7 @@ class TokenMap {
     return true;
   }
   void set(const Coord& token, const T& value) {
-    if (T* there = const_cast<T*>(find(token)))
-      *there = value;
-    else
-      insert(token, value);
+    if (!insert(token, value)) values_[size_t(rows_.getValue(token))] = value;
   }
   /// Null where the token has no value. Safe to call from several threads.
   const T* find(const Coord& token) const {
