@@ -151,7 +151,7 @@ TEST(Masks, BoundsAreTheSamplesOwnOrAroundOrWithinThem) {
     for (int axis = 0; axis < 3; ++axis) {
       EXPECT_EQ((b.min()[axis] - own.min()[axis]) % 4, 0);
       EXPECT_EQ((b.max()[axis] - own.max()[axis]) % 4, 0);
-      EXPECT_LE(b.dim()[axis] * s.condition.frame.voxel_m, 16.01);
+      EXPECT_LE(static_cast<float>(b.dim()[axis]) * s.condition.frame.voxel_m, 16.01F);
       EXPECT_GT(b.dim()[axis], 0);
       outwards += b.min()[axis]<own.min()[axis], inwards += b.min()[axis]> own.min()[axis];
     }
