@@ -3,6 +3,7 @@
 #include <embree3/rtcore.h>
 #include <tbb/task_arena.h>
 
+#include <algorithm>
 #include <array>
 #include <atomic>
 #include <cmath>
@@ -26,7 +27,12 @@ struct Packet {
   alignas(64) std::array<int, kPacket> valid;
   std::array<Eigen::Vector3f, kPacket> passed;  // by a shadow ray through glass
 
-  Packet() { valid.fill(0); }
+  // Where Embree splits packets into smaller ones it takes rays for unset by tnear > tfar alone.
+  Packet() {
+    valid.fill(0);
+    query.ray = {};
+    std::fill_n(query.ray.tfar, kPacket, -1.f);
+  }
   void set(int k, const Eigen::Vector3f& o, const Eigen::Vector3f& d, float tfar) {
     RTCRay16& r = query.ray;
     r.org_x[k] = o.x(), r.org_y[k] = o.y(), r.org_z[k] = o.z();
