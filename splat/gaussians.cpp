@@ -17,6 +17,12 @@ void Gaussians::resize(int64_t n, int degree) {
   sh.resize(count * size_t(shCoefficients()) * 3, 0.f);
 }
 
+void moveOrigin(const Eigen::Vector3d& origin, Gaussians* g) {
+  const Eigen::Vector3d shift = g->origin - origin;
+  for (Eigen::Vector3f& mean : g->mean) mean = (mean.cast<double>() + shift).cast<float>();
+  g->origin = origin;
+}
+
 void requireConsistent(const Gaussians& g) {
   require(g.sh_degree >= 0 && g.sh_degree <= 3, "Gaussians: expected an SH degree 0-3, found ",
           g.sh_degree);

@@ -40,6 +40,9 @@ inline Eigen::Vector3f worldMean(const Gaussians& g, size_t row) {
   return (g.origin + g.mean[row].cast<double>()).cast<float>();
 }
 
+/// Means from another origin, at the same places.
+void moveOrigin(const Eigen::Vector3d& origin, Gaussians* gaussians);
+
 /// Throws Error unless all arrays have matching lengths and the SH degree is 0-3.
 void requireConsistent(const Gaussians& gaussians);
 
