@@ -28,6 +28,13 @@ Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
     progress.start("encode");
     Place place = encoder.encode(views, observation, progress);
     progress.end();
+    if (settings.detail.seconds > 0) {
+      progress.start("detail");
+      for (const View& view : views) place.cameras.push_back(view.camera);
+      place.detail = std::make_shared<Detail>(
+          seenDetail(views, settings.detail, place.frame.world_from_grid.translation(), progress));
+      progress.end();
+    }
     return place;
   });
 }
@@ -39,6 +46,8 @@ Place completeScene(const std::vector<View>& views, const Encoder& encoder,
                               progress);
   });
 }
+
+namespace {
 
 SceneVoxels sceneVoxels(const DecodedGrid& d, const Place& place) {
   SceneVoxels v;
@@ -71,7 +80,8 @@ SceneVoxels sceneVoxels(const DecodedGrid& d, const Place& place) {
   return v;
 }
 
-Provenance gaussianProvenance(const SceneVoxels& voxels, int64_t per_voxel) {
+// Of the decoded Gaussians.
+Provenance provenanceOf(const SceneVoxels& voxels, int64_t per_voxel) {
   Provenance p;
   for (size_t i = 0; i < voxels.ijk.size(); ++i)
     for (int64_t g = 0; g < per_voxel; ++g) {
@@ -79,6 +89,24 @@ Provenance gaussianProvenance(const SceneVoxels& voxels, int64_t per_voxel) {
       p.probability.push_back(voxels.probability[i]);
     }
   return p;
+}
+
+}  // namespace
+
+Scene sceneOf(const DecodedGrid& decoded, const Place& place) {
+  Scene scene{sceneVoxels(decoded, place), {}};
+  const int64_t voxels = scene.voxels.size();
+  const int64_t per_voxel = voxels ? decoded.gaussians.size() / voxels : 0;
+  const Provenance provenance = provenanceOf(scene.voxels, per_voxel);
+  if (!place.detail || voxels == 0) {
+    scene.splats = {decoded.gaussians, provenance};
+    return scene;
+  }
+  JoinSettings joining;
+  joining.voxel_m = place.frame.voxel_m;
+  scene.splats = join(place.detail->discs, decoded.gaussians, provenance, int(per_voxel),
+                      place.cameras, joining);
+  return scene;
 }
 
 namespace {
@@ -160,25 +188,14 @@ void writeTogether(const Writers& writers, const std::string& stem, Progress& pr
 }
 
 // The grids and Gaussians of a scene.
-Writers sceneWriters(const SceneVoxels& voxels, const Gaussians& gaussians,
-                     const Provenance& provenance, const Eigen::Vector3d& up) {
-  return {{".points.vdb",
-           [&](const std::string& path) { writePointsVdb(gaussians, provenance, path); }},
-          {".ply", [&gaussians,
-                    up](const std::string& path) { writePly(gaussians, path, up.cast<float>()); }},
-          {".vdb", [&](const std::string& path) { writeSceneVdb(voxels, path); }}};
-}
-
-// A scene's files and `more`.
-void writeScene(const DecodedGrid& decoded, const Place& place, const std::string& stem,
-                const Eigen::Vector3d& up, const Writers& more, Progress& progress) {
-  const SceneVoxels voxels = sceneVoxels(decoded, place);
-  const int64_t per_voxel =
-      voxels.ijk.empty() ? 0 : decoded.gaussians.size() / int64_t(voxels.ijk.size());
-  const Provenance provenance = gaussianProvenance(voxels, per_voxel);
-  Writers writers = sceneWriters(voxels, decoded.gaussians, provenance, up);
-  writers.insert(writers.end(), more.begin(), more.end());
-  writeTogether(writers, stem, progress);
+Writers sceneWriters(const Scene& scene, const Eigen::Vector3d& up) {
+  const Gaussians& gaussians = scene.splats.gaussians;
+  return {
+      {kPointsEnding,
+       [&](const std::string& path) { writePointsVdb(gaussians, scene.splats.provenance, path); }},
+      {".ply",
+       [&gaussians, up](const std::string& path) { writePly(gaussians, path, up.cast<float>()); }},
+      {".vdb", [&](const std::string& path) { writeSceneVdb(scene.voxels, path); }}};
 }
 
 Eigen::Vector3d upOf(const VoxelFrame& frame) { return frame.world_from_grid.linear().col(2); }
@@ -213,8 +230,8 @@ std::string outputStem(const std::string& path, const std::vector<std::string>& 
   return stem;
 }
 
-DecodedGrid writePlace(const Place& place, const std::vector<View>& views, const Encoder& encoder,
-                       const SceneSettings& settings, const std::string& stem, Progress& progress) {
+Scene writePlace(const Place& place, const std::vector<View>& views, const Encoder& encoder,
+                 const SceneSettings& settings, const std::string& stem, Progress& progress) {
   const auto decode = [&](const Place& part) {
     DecodedGrid decoded = encoder.decode(part, settings.child_threshold, progress);
     decoded.gaussians.antialias = settings.antialias;
@@ -222,48 +239,61 @@ DecodedGrid writePlace(const Place& place, const std::vector<View>& views, const
   };
   return withThreads(settings.threads, [&] {
     progress.start("decode");
-    DecodedGrid decoded = decode(place);
+    Scene scene = sceneOf(decode(place), place);
     progress.end();
-    Writers more = {{kLatentEnding, [&](const std::string& path) { writeLatentVdb(place, path); }}};
-    if (!views.empty())
-      more.push_back({kPictureEnding, [&](const std::string& path) {
-                        const Gaussians observed = decode(observedPart(place)).gaussians;
-                        writePng(contactSheet(views, observed, decoded.gaussians,
-                                              settings.observing.volume.up),
-                                 path);
-                      }});
     const Eigen::Vector3d up = views.empty() ? upOf(place.frame) : settings.observing.volume.up;
-    writeScene(decoded, place, stem, up, more, progress);
-    return decoded;
+    Writers writers = sceneWriters(scene, up);
+    writers.push_back(
+        {kLatentEnding, [&](const std::string& path) { writeLatentVdb(place, path); }});
+    if (!views.empty())
+      writers.push_back(
+          {kPictureEnding, [&](const std::string& path) {
+             const Gaussians observed =
+                 place.detail ? place.detail->discs : decode(observedPart(place)).gaussians;
+             writePng(contactSheet(views, observed, scene.splats.gaussians, up), path);
+           }});
+    writeTogether(writers, stem, progress);
+    return scene;
   });
 }
 
-void writeDecoded(const DecodedGrid& decoded, const Place& place, const std::string& stem,
-                  Progress& progress) {
-  writeScene(decoded, place, stem, upOf(place.frame), {}, progress);
+void writeScene(const Scene& scene, const std::string& stem, Progress& progress) {
+  writeTogether(sceneWriters(scene, upOf(scene.voxels.frame)), stem, progress);
 }
 
 Rethresholded rethreshold(const std::string& from, float tau, const std::string& to,
                           Progress& progress) {
   progress.start("read");
-  const std::string grids = from + ".vdb", points = from + ".points.vdb";
+  const std::string grids = from + ".vdb", points = from + kPointsEnding;
   const SceneVoxels all = readSceneVdb(grids);
-  Provenance origin;
-  Gaussians gaussians = readPointsVdb(points, &origin);
+  SplatScene splats;
+  splats.gaussians = readPointsVdb(points, &splats.provenance);
+  const Provenance& origin = splats.provenance;
   require(origin.recorded, "rethreshold: ", points,
           ": expected Gaussians with `probability` and `completed`, found neither");
   progress.end();
-  const SceneVoxels kept =
-      keepRows(all, [&](size_t i) { return all.observed[i] || all.probability[i] > tau; });
-  require(kept.size() < all.size(), "rethreshold: ", grids, ": every generated voxel exceeds ", tau,
-          " already (expected a tau that is larger)");
+  Scene kept{keepRows(all, [&](size_t i) { return all.observed[i] || all.probability[i] > tau; }),
+             {}};
+  require(kept.voxels.size() < all.size(), "rethreshold: ", grids,
+          ": every generated voxel exceeds ", tau, " already (expected a tau that is larger)");
   std::vector<int64_t> rows;
   for (int64_t i = 0; i < origin.size(); ++i)
     if (!origin.generated[size_t(i)] || origin.probability[size_t(i)] > tau) rows.push_back(i);
-  const Gaussians chosen = selectRows(std::move(gaussians), rows);
-  writeTogether(sceneWriters(kept, chosen, selectRows(origin, rows), upOf(kept.frame)), to,
-                progress);
-  return {kept.size(), chosen.size(), all.size() - kept.size()};
+  kept.splats.provenance = selectRows(origin, rows);
+  kept.splats.gaussians = selectRows(std::move(splats.gaussians), rows);
+  writeScene(kept, to, progress);
+  return {kept.voxels.size(), kept.splats.gaussians.size(), all.size() - kept.voxels.size()};
+}
+
+std::shared_ptr<const Detail> readDetail(const std::string& path, const VoxelFrame& frame) {
+  Provenance provenance;
+  Gaussians all = readPointsVdb(path, &provenance);
+  auto detail = std::make_shared<Detail>();
+  detail->discs = keepRows(std::move(all), [&](size_t i) { return !provenance.generated[i]; });
+  require(detail->discs.sh_degree == 0 && detail->discs.size() > 0, "readDetail: ", path,
+          ": expected observed Gaussians of SH degree 0");
+  moveOrigin(frame.world_from_grid.translation(), &detail->discs);
+  return detail;
 }
 
 }  // namespace vdbc

@@ -1,12 +1,13 @@
 #pragma once
 // The main job: views in, completed place out.
-#include <optional>
+#include <memory>
 #include <string>
 #include <vector>
 
 #include "encoder/encoder.h"
 #include "mar/completer.h"
-#include "splat/points_vdb.h"
+#include "splat/detail.h"
+#include "splat/join.h"
 #include "vdb/scene_vdb.h"
 
 namespace vdbc {
@@ -16,11 +17,12 @@ struct SceneSettings {
   CompleteSettings completion;
   float child_threshold = .05f;  // of BCE-up, for voxels that were not observed
   bool antialias = false;        // decoded Gaussians are made for RasterSettings::antialias
+  DetailSettings detail;         // what views saw comes at the resolution of their pixels
   int threads = 0;               // that a call may use; 0: those of the caller's task arena
 };
 
 /// The place as observed: fits the volume (voxels as the encoder's weights want them), carves,
-/// encodes.
+/// encodes, and where asked for makes discs of the views.
 Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
                   const SceneSettings& settings, Progress& progress);
 
@@ -28,11 +30,14 @@ Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
 Place completeScene(const std::vector<View>& views, const Encoder& encoder,
                     const Completer& completer, const SceneSettings& settings, Progress& progress);
 
-/// Voxels with colour, density and provenance, from decoded content. A voxel's probability is its
-/// token's.
-SceneVoxels sceneVoxels(const DecodedGrid& decoded, const Place& place);
-/// Provenance of each Gaussian.
-Provenance gaussianProvenance(const SceneVoxels& voxels, int64_t gaussians_per_voxel);
+/// What a place looks like.
+struct Scene {
+  SceneVoxels voxels;
+  SplatScene splats;
+};
+/// Voxels with colour, density and provenance, from decoded content; a voxel's probability is its
+/// token's. Gaussians: the decoded ones or, where the place has its views' detail, both joined.
+Scene sceneOf(const DecodedGrid& decoded, const Place& place);
 
 /// Picture: a row of input views, then for novel views (the mean camera place, four headings) a row
 /// as observed and a row as completed.
@@ -43,7 +48,8 @@ Image contactSheet(const std::vector<View>& views, const Gaussians& observed,
 void requireCreatable(const std::string& path);
 
 /// Endings of the files that a completion writes beside X.vdb; X.png only from views.
-constexpr const char* kSceneEndings[] = {".points.vdb", ".ply", ".vdb"};
+constexpr const char* kPointsEnding = ".points.vdb";
+constexpr const char* kSceneEndings[] = {kPointsEnding, ".ply", ".vdb"};
 constexpr const char* kLatentEnding = ".latent.vdb";
 constexpr const char* kPictureEnding = ".png";
 
@@ -52,14 +58,17 @@ constexpr const char* kPictureEnding = ".png";
 std::string outputStem(const std::string& vdb_path, const std::vector<std::string>& more);
 
 /// Decodes a completed place and writes X.vdb, X.points.vdb, X.ply, X.latent.vdb and, from views,
-/// X.png; returns what was decoded. All are written to temporary names; a failure leaves none of
+/// X.png; returns what was written. All are written to temporary names; a failure leaves none of
 /// this run's files behind.
-DecodedGrid writePlace(const Place& place, const std::vector<View>& views, const Encoder& encoder,
-                       const SceneSettings& settings, const std::string& stem, Progress& progress);
+Scene writePlace(const Place& place, const std::vector<View>& views, const Encoder& encoder,
+                 const SceneSettings& settings, const std::string& stem, Progress& progress);
 
-/// X.vdb, X.points.vdb and X.ply from decoded content alone; up is the grid's z.
-void writeDecoded(const DecodedGrid& decoded, const Place& place, const std::string& stem,
-                  Progress& progress);
+/// X.vdb, X.points.vdb and X.ply alone; up is the grid's z.
+void writeScene(const Scene& scene, const std::string& stem, Progress& progress);
+
+/// What views saw of a finished place: the Gaussians of its X.points.vdb that are not generated.
+/// Throws Error where the file is missing, unreadable or has none.
+std::shared_ptr<const Detail> readDetail(const std::string& points_path, const VoxelFrame& frame);
 
 struct Rethresholded {
   int64_t voxels = 0, gaussians = 0, dropped_voxels = 0;

@@ -48,6 +48,15 @@ std::vector<Option> volumeOptions(SceneOptions* o) {
           scaleOption(&o->metres_per_unit)};
 }
 
+std::vector<Option> detailOptions(DetailSettings* s) {
+  return {option("--detail SECONDS", &s->seconds,
+                 "to spend on making what views saw as sharp as their pixels, counted by a fixed "
+                 "cost model; 0: as coarse as the rest")
+              .between(0, 3600),
+          option("--splats N", &s->splats, "at most for what views saw; 0: as its content asks")
+              .between(0, 100000000)};
+}
+
 Option tauOption(CompleteSettings* settings) {
   return option("--tau P", &settings->tau,
                 "a token is kept above this probability: lower fills more, with more mistakes")

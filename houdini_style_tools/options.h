@@ -30,6 +30,9 @@ Option antialiasOption(bool* antialias);
 /// Where to complete: bounds, up, scale.
 std::vector<Option> volumeOptions(SceneOptions* o);
 
+/// How sharp what views saw is.
+std::vector<Option> detailOptions(DetailSettings* settings);
+
 Option tauOption(CompleteSettings* settings);
 Option fromLevelOption(CompleteSettings* settings);
 /// How a place grows, beside tau.

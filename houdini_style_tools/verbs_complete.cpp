@@ -1,6 +1,7 @@
 // The main job, and a finished place with another tau.
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <filesystem>
 #include <memory>
 #include <nlohmann/json.hpp>
@@ -80,6 +81,11 @@ std::shared_ptr<const TokenMask> allowedTokens(const CompleteOptions& o, const V
   return allowed;
 }
 
+// X.points.vdb of X.latent.vdb.
+std::string pointsBeside(const std::string& latents) {
+  return latents.substr(0, latents.size() - std::strlen(kLatentEnding)) + kPointsEnding;
+}
+
 // The place to start from, and the views that it was seen in: none where it is from a file.
 struct Start {
   SceneInput in;
@@ -90,6 +96,9 @@ Start readStart(const CompleteOptions& o, const Encoder& encoder, const std::str
                 Progress& progress) {
   if (o.fromLatents()) {
     Place place = readLatents(o.in.views, encoder, weights);
+    const std::string points = pointsBeside(o.in.views);
+    if (!place.cameras.empty() && fs::exists(points) && o.in.settings.detail.seconds > 0)
+      place.detail = readDetail(points, place.frame);
     const Eigen::Vector3d up = place.frame.world_from_grid.linear().col(2);
     progress.end();
     return {{{}, settingsOf(o.in, up)}, std::move(place)};
@@ -119,7 +128,7 @@ Place chooseTokens(const CompleteOptions& o, const Place& all, CompleteSettings*
 // What a completion made.
 struct Made {
   Place place;
-  DecodedGrid decoded;
+  Scene scene;
 };
 
 // One completion from encoded tokens to files, checkpointed on the way.
@@ -132,14 +141,13 @@ Made cookSample(const SceneInput& in, Place start, const Encoder& encoder,
   if (o.resume && fs::exists(checkpoint))
     naming("--resume", [&] { readCheckpoint(checkpoint, identity, &start, &settings); });
   return naming(o.in.views, [&] {
-    Made made;
-    made.place =
+    Place place =
         completer.complete(start, settings, progress, [&](const Place& so_far, int32_t next_level) {
           writeCheckpoint(so_far, next_level, identity, checkpoint);
         });
-    made.decoded = writePlace(made.place, in.views, encoder, in.settings, stem, progress);
+    Scene scene = writePlace(place, in.views, encoder, in.settings, stem, progress);
     fs::remove(checkpoint);
-    return made;
+    return Made{std::move(place), std::move(scene)};
   });
 }
 
@@ -147,13 +155,21 @@ constexpr double kFinePlyStep = .001;  // metres
 
 ordered_json summaryOf(const SceneInput& in, const Made& made) {
   const auto& generated = made.place.generated;
+  const Gaussians& gaussians = made.scene.splats.gaussians;
+  const auto& splats = made.scene.splats.provenance.generated;
+  const auto& detail = made.place.detail;
   const auto observed = std::count(generated.begin(), generated.end(), uint8_t(0));
   return {{"views", in.views.size()},
           {"observed_tokens", observed},
           {"generated_tokens", made.place.size() - observed},
-          {"voxels", made.decoded.voxels.size()},
-          {"gaussians", made.decoded.gaussians.size()},
-          {"ply_step_m", plyStep(made.decoded.gaussians)}};
+          {"voxels", made.scene.voxels.size()},
+          {"gaussians", gaussians.size()},
+          {"observed_gaussians", std::count(splats.begin(), splats.end(), uint8_t(0))},
+          {"detail_steps", detail ? detail->steps : 0},
+          {"detail_seconds", detail ? detail->seconds : 0},
+          {"detail_estimated_seconds", detail ? detail->estimated_seconds : 0},
+          {"detail_missing", !detail && !made.place.cameras.empty()},
+          {"ply_step_m", plyStep(gaussians)}};
 }
 
 void printCompletion(const Run& run, const CompleteOptions& o, const std::string& stem,
@@ -163,12 +179,16 @@ void printCompletion(const Run& run, const CompleteOptions& o, const std::string
   std::string text =
       joinText(made["views"], " views: ", made["observed_tokens"], " tokens observed, ",
                made["generated_tokens"], " generated; ", made["voxels"], " voxels, ",
-               made["gaussians"], " Gaussians; ", std::round(seconds * 10) / 10, " s\n", stem,
-               ".vdb  ", stem, ".points.vdb  ", stem, ".ply  ", stem, kLatentEnding);
+               made["gaussians"], " Gaussians, ", made["observed_gaussians"],
+               " of them of what was seen; ", std::round(seconds * 10) / 10, " s\n", stem, ".vdb  ",
+               stem, ".points.vdb  ", stem, ".ply  ", stem, kLatentEnding);
   if (!o.fromLatents()) text += joinText("  ", stem, kPictureEnding);
   if (made["ply_step_m"] > kFinePlyStep)
     text += joinText("\n", stem, ".ply: its numbers have steps of ", made["ply_step_m"],
                      " m so far from the world's origin; ", stem, ".points.vdb has none");
+  if (o.fromLatents() && made["detail_missing"])
+    text += joinText("\n", pointsBeside(o.in.views),
+                     ": no such file: what views saw is as coarse as the latents have it");
   if (o.samples > 1)
     text +=
         joinText("\nthe same of ", o.samples - 1, " more with other seeds: ", sampleStem(stem, 2),
@@ -192,7 +212,7 @@ void cookComplete(const CompleteOptions& o, const Run& run, Progress& progress) 
     in.settings.completion.seed = run.seed + uint64_t(n - 1);
     const Made made = cookSample(in, start, encoder, completer, sampleStem(stem, n), o, progress);
     if (n == 1) summary = summaryOf(in, made);
-    samples.push_back(made.decoded.voxels);
+    samples.push_back(made.scene.voxels.ijk);
   }
   if (o.samples > 1) writeOccupancyVdb(all.frame, samples, stem + kOccupancyEnding);
   summary["seconds"] = secondsSince(begin), summary["peak_mb"] = peakMemoryMb();
@@ -240,6 +260,7 @@ Verb completeVerb() {
                  .required(),
              framesOption(&o->in.frames), tauOption(&s->completion), marginOption(s),
              weightsOption(&o->in.weights)}},
+           {"What was seen", detailOptions(&s->detail)},
            {"Where", volumeOptions(&o->in)},
            {"A part, again, or several times",
             {option("--region MASK.vdb", &o->region, "nothing is generated outside of it")

@@ -60,8 +60,13 @@ void cookDecode(const DecodeOptions& o, const Run& run, Progress& progress) {
       naming(o.latents, [&] { return encoder.decode(place, o.child_tau, progress); });
   decoded.gaussians.antialias = o.antialias;
   progress.end();
-  writeDecoded(decoded, place, stem, progress);
+  const Scene scene = sceneOf(decoded, place);
+  writeScene(scene, stem, progress);
   const double seconds = secondsSince(start);
+  const char* coarse =
+      "\nWhat views saw is as coarse as the latents have it; X.points.vdb of the completion has "
+      "its "
+      "detail.";
   printResult(run.json,
               {{"tokens", place.size()},
                {"voxels", decoded.voxels.size()},
@@ -70,7 +75,8 @@ void cookDecode(const DecodeOptions& o, const Run& run, Progress& progress) {
                {"output", stem}},
               joinText(place.size(), " tokens: ", decoded.voxels.size(), " voxels, ",
                        decoded.gaussians.size(), " Gaussians; ", std::round(seconds * 10) / 10,
-                       " s\n", stem, ".vdb  ", stem, ".points.vdb  ", stem, ".ply"));
+                       " s\n", stem, ".vdb  ", stem, ".points.vdb  ", stem, ".ply",
+                       place.cameras.empty() ? "" : coarse));
 }
 
 }  // namespace

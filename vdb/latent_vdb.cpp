@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <sstream>
 
 #include "vdb/point_leaves.h"
 #include "vdb/vdb_file.h"
@@ -30,6 +31,8 @@ constexpr const char* kDim = "latent_dim";
 constexpr const char* kHash = "encoder_hash";
 constexpr const char* kGrowth = "growth";
 constexpr const char* kFrame = "world_from_grid";
+constexpr const char* kCamera = "camera_";  // and a number: width height fx fy cx cy, pose by rows
+constexpr int kMaxCameras = 65536;
 
 // Calls visit(column, value type, codec) for each column that is an attribute: all but the
 // coordinates, which are where the points lie. Flags are bool in files.
@@ -121,6 +124,31 @@ PointGrid::Ptr latentGrid(const Place& g, const std::string& path) {
   return grid;
 }
 
+std::string textOf(const Camera& c) {
+  std::ostringstream out;
+  out.precision(17);
+  out << c.width << ' ' << c.height << ' ' << c.fx << ' ' << c.fy << ' ' << c.cx << ' ' << c.cy;
+  for (int row = 0; row < 3; ++row)
+    for (int col = 0; col < 4; ++col) out << ' ' << c.world_from_camera(row, col);
+  return out.str();
+}
+
+Camera cameraOf(const std::string& text, const std::string& path) {
+  Camera c;
+  std::istringstream in(text);
+  in >> c.width >> c.height >> c.fx >> c.fy >> c.cx >> c.cy;
+  for (int row = 0; row < 3; ++row)
+    for (int col = 0; col < 4; ++col) in >> c.world_from_camera.matrix()(row, col);
+  const Eigen::Matrix3d turn = c.world_from_camera.linear();
+  const bool sane = !in.fail() && c.width > 0 && c.height > 0 && c.width <= 32768 &&
+                    c.height <= 32768 && c.fx > 0 && c.fy > 0 && c.fx < 1e9 && c.fy < 1e9 &&
+                    std::abs(c.cx) < 1e9 && std::abs(c.cy) < 1e9 &&
+                    (turn.transpose() * turn - Eigen::Matrix3d::Identity()).norm() < .01 &&
+                    c.world_from_camera.translation().norm() < kMaxWorldM;
+  require(sane, kRead, ": ", path, ": expected a camera of 18 numbers, found '", text, "'");
+  return c;
+}
+
 openvdb::MetaMap metadataOf(const Place& g) {
   openvdb::MetaMap metadata;
   metadata.insertMeta("creator", openvdb::StringMetadata("vdb_complete"));
@@ -133,6 +161,8 @@ openvdb::MetaMap metadataOf(const Place& g) {
   for (int row = 0; row < 4; ++row)
     for (int col = 0; col < 4; ++col) frame[row][col] = g.frame.world_from_grid.matrix()(col, row);
   metadata.insertMeta(kFrame, openvdb::Mat4DMetadata(frame));
+  for (size_t i = 0; i < g.cameras.size(); ++i)
+    metadata.insertMeta(joinText(kCamera, i), openvdb::StringMetadata(textOf(g.cameras[i])));
   const auto observed = std::count(g.generated.begin(), g.generated.end(), uint8_t(0));
   metadata.insertMeta("observed_count", openvdb::Int64Metadata(int64_t(observed)));
   metadata.insertMeta("generated_count", openvdb::Int64Metadata(g.size() - observed));
@@ -254,6 +284,9 @@ Place readLatentVdb(const std::string& path) {
         exactFrame(metadata, readVolume(kRead, metadata, grid->transform(), level, path), path);
   g.encoder_hash = findMetadata<std::string>(kRead, metadata, kHash, path);
   if (metadata[kGrowth]) g.growth = findMetadata<std::string>(kRead, metadata, kGrowth, path);
+  for (int i = 0; i < kMaxCameras && metadata[joinText(kCamera, i)]; ++i)
+    g.cameras.push_back(cameraOf(
+        findMetadata<std::string>(kRead, metadata, joinText(kCamera, i).c_str(), path), path));
   try {
     readTokens(*tokens, &g, path);
   } catch (const openvdb::Exception& error) {  // an attribute of another type

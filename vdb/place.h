@@ -9,6 +9,8 @@
 
 namespace vdbc {
 
+struct Detail;
+
 /// N tokens of tree level `level` (1: nodes of 2^3 voxels), observed ones and generated ones, and
 /// the space that the views saw. docs/method.md, section 1.
 struct Place {
@@ -17,6 +19,11 @@ struct Place {
       seen;                  // F and E of the views, voxels; never null in a finished place
   std::string encoder_hash;  // of the weights that made the latents, Encoder::hash()
   std::string growth;        // of a completion that was cut short: where it goes on; else empty
+  /// What the views saw at the resolution of their pixels, from the grid's origin (splat/detail.h),
+  /// and the views' cameras; null and none where it was not asked for. Files of latents hold the
+  /// cameras alone.
+  std::shared_ptr<const Detail> detail;
+  std::vector<Camera> cameras;
   int level = 1;
   int dim = 0;                     // latent channels
   std::vector<Coord> ijk;          // [N] in units of `level`

@@ -397,7 +397,11 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   resetPeakMemory();
   auto start = std::chrono::steady_clock::now();
   const Place place = completeScene(scene.input, encoder, completer, s, progress);
-  const DecodedGrid completed = encoder.decode(place, s.child_threshold, progress);
+  const auto look = [&](const Place& p) -> MethodOutput {
+    Scene made = sceneOf(encoder.decode(p, s.child_threshold, progress), p);
+    return {std::move(made.splats.gaussians), std::move(made.voxels.ijk)};
+  };
+  const MethodOutput completed = look(place);
   const double completed_seconds = secondsSince(start);
   const double completed_rss = peakMemoryMb();
   const VoxelFrame& frame = place.frame;
@@ -425,11 +429,14 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   start = std::chrono::steady_clock::now();
   const Observation o = observe(scene.input, encoder.observing(s.observing), progress);
   const double observe_seconds = secondsSince(start);
-  const Place seen_place = encoder.encode(scene.input, o, progress);
-  const DecodedGrid decoded = encoder.decode(seen_place, s.child_threshold, progress);
-  const double observed_seconds = secondsSince(start);
-  const MethodOutput observed{decoded.gaussians, decoded.voxels};
-  const SceneVoxels seen = sceneVoxels(decoded, seen_place);
+  Place seen_place = encoder.encode(scene.input, o, progress);
+  // The same detail of what was seen for all methods.
+  seen_place.detail = place.detail, seen_place.cameras = place.cameras;
+  const Scene observed_scene =
+      sceneOf(encoder.decode(seen_place, s.child_threshold, progress), seen_place);
+  const double observed_seconds = secondsSince(start) + (place.detail ? place.detail->seconds : 0);
+  const SceneVoxels& seen = observed_scene.voxels;
+  const MethodOutput observed{observed_scene.splats.gaussians, seen.ijk};
   add("observed", observed, observed_seconds);
 
   start = std::chrono::steady_clock::now();
@@ -446,7 +453,7 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   start = std::chrono::steady_clock::now();
   const MethodOutput box = manhattanBox(observed, seen, states);
   add("box", box, observed_seconds + secondsSince(start));
-  add("completed", {completed.gaussians, completed.voxels}, completed_seconds);
+  add("completed", completed, completed_seconds);
   results.back().peak_rss_mb = completed_rss;
 
   if (scene.truth) {
@@ -455,17 +462,14 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
     start = std::chrono::steady_clock::now();
     const Place oracle = completer.completeAt(seen_place, surfaceNodes(*scene.truth, frame, 1),
                                               s.completion, progress);
-    const DecodedGrid d = encoder.decode(oracle, s.child_threshold, progress);
-    add("oracle-occupancy", {d.gaussians, d.voxels}, observed_seconds + secondsSince(start));
+    add("oracle-occupancy", look(oracle), observed_seconds + secondsSince(start));
   }
   if (!picture.empty()) writeColumns(columns, picture);
   for (double tau : taus) {
     s.completion.tau = float(tau);
     start = std::chrono::steady_clock::now();
     const Place other = completer.complete(seen_place, s.completion, progress);
-    const DecodedGrid d = encoder.decode(other, s.child_threshold, progress);
-    add(joinText("completed-tau-", tau), {d.gaussians, d.voxels},
-        observed_seconds + secondsSince(start));
+    add(joinText("completed-tau-", tau), look(other), observed_seconds + secondsSince(start));
   }
   return results;
 }

@@ -252,6 +252,13 @@ std::vector<ReconstructionResult> evaluateReconstruction(
     ours.leak = sceneLeak(scene, o.frame, decoded.voxels);
     start = Clock::now();
   }
+  if (s.detail.seconds > 0) {
+    progress.start("detail");
+    const Detail detail =
+        seenDetail(scene.input, s.detail, o.frame.world_from_grid.translation(), progress);
+    progress.end();
+    measure("detail", detail.discs, secondsSince(start));
+  }
   const Gaussians means = voxelMean(o, encoder.config().gaussians_per_voxel);
   ReconstructionResult& voxel_mean =
       measure("voxel-mean", means, observe_seconds + secondsSince(start));

@@ -56,7 +56,8 @@ Gaussians optimised(const Gaussians& start, const std::vector<View>& views,
 SetScores splitScores(const TriangleMesh& truth, const Observation& observation,
                       const std::vector<Coord>& voxels, int level);
 
-/// Methods: reconstructed, voxel-mean, pixel-aligned, optimised (where optimise_seconds > 0). With
+/// Methods: reconstructed (by the decoder), detail (seenDetail(); none where its seconds are 0),
+/// voxel-mean, pixel-aligned, optimised (where optimise_seconds > 0). With
 /// a `picture` writes a PNG: two input and two other views; the truth, then a column a method.
 std::vector<ReconstructionResult> evaluateReconstruction(
     const EvaluationScene& scene, const Encoder& encoder, const SceneSettings& settings,
