@@ -4,7 +4,7 @@ include(GNUInstallDirs)
 include(CMakePackageConfigHelpers)
 
 target_sources(vdbc_core PUBLIC FILE_SET HEADERS BASE_DIRS ${PROJECT_SOURCE_DIR} FILES
-  vdb/camera.h vdb/carve.h vdb/columns.h vdb/error.h vdb/fit_volume.h vdb/frame.h vdb/frontier.h vdb/latent_vdb.h
+  vdb/camera.h vdb/carve.h vdb/columns.h vdb/error.h vdb/fit_volume.h vdb/frame.h vdb/frontier.h vdb/fuse.h vdb/grid_instances.h vdb/latent_vdb.h
   vdb/mask_vdb.h vdb/place.h vdb/progress.h vdb/scene_vdb.h vdb/seen.h vdb/threads.h vdb/token_grid.h vdb/token_map.h
   splat/detail.h splat/exr.h splat/gaussians.h splat/image.h splat/image_files.h splat/join.h splat/metrics.h splat/ply.h splat/points_vdb.h
   splat/rasterize.h splat/rays.h splat/view.h

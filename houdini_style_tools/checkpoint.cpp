@@ -69,6 +69,7 @@ void readCheckpoint(const std::string& path, const std::string& identity, Place*
           ": is of another place, settings or weights (expected ", identity, ", found ",
           growth.dump(), ")");
   place.growth.clear();
+  place.detail = start->detail, place.cameras = start->cameras;  // not of the file
   *start = std::move(place);
   settings->first_level = next_level, settings->resumed = true;
 }

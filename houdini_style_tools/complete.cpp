@@ -12,12 +12,29 @@
 #include "splat/image_files.h"
 #include "splat/ply.h"
 #include "splat/rasterize.h"
+#include "vdb/fuse.h"
 #include "vdb/latent_vdb.h"
 #include "vdb/threads.h"
 
 namespace vdbc {
 
 namespace fs = std::filesystem;
+
+namespace {
+
+std::shared_ptr<const Detail> detailOf(const std::vector<View>& views, const Place& place,
+                                       const SceneSettings& settings, Progress& progress) {
+  const auto detail = std::make_shared<Detail>(
+      seenDetail(views, settings.detail, place.frame.world_from_grid.translation(), progress));
+  std::vector<DepthView> depths;
+  for (const View& view : views) depths.push_back(view.depthView());
+  FuseSettings fusing;
+  fusing.voxel_m = settings.detail.voxel_m, fusing.carving = settings.observing.carving;
+  detail->distance = fuseDepth(place.frame, *place.seen, depths, fusing);
+  return detail;
+}
+
+}  // namespace
 
 Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
                   const SceneSettings& settings, Progress& progress) {
@@ -31,8 +48,7 @@ Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
     if (settings.detail.seconds > 0) {
       progress.start("detail");
       for (const View& view : views) place.cameras.push_back(view.camera);
-      place.detail = std::make_shared<Detail>(
-          seenDetail(views, settings.detail, place.frame.world_from_grid.translation(), progress));
+      place.detail = detailOf(views, place, settings, progress);
       progress.end();
     }
     return place;
@@ -98,6 +114,7 @@ Scene sceneOf(const DecodedGrid& decoded, const Place& place) {
   const int64_t voxels = scene.voxels.size();
   const int64_t per_voxel = voxels ? decoded.gaussians.size() / voxels : 0;
   const Provenance provenance = provenanceOf(scene.voxels, per_voxel);
+  if (place.detail) scene.voxels.seen_distance = place.detail->distance;
   if (!place.detail || voxels == 0) {
     scene.splats = {decoded.gaussians, provenance};
     return scene;
@@ -285,7 +302,8 @@ Rethresholded rethreshold(const std::string& from, float tau, const std::string&
   return {kept.voxels.size(), kept.splats.gaussians.size(), all.size() - kept.voxels.size()};
 }
 
-std::shared_ptr<const Detail> readDetail(const std::string& path, const VoxelFrame& frame) {
+std::shared_ptr<const Detail> readDetail(const std::string& stem, const VoxelFrame& frame) {
+  const std::string path = stem + kPointsEnding;
   Provenance provenance;
   Gaussians all = readPointsVdb(path, &provenance);
   auto detail = std::make_shared<Detail>();
@@ -293,6 +311,7 @@ std::shared_ptr<const Detail> readDetail(const std::string& path, const VoxelFra
   require(detail->discs.sh_degree == 0 && detail->discs.size() > 0, "readDetail: ", path,
           ": expected observed Gaussians of SH degree 0");
   moveOrigin(frame.world_from_grid.translation(), &detail->discs);
+  detail->distance = readSceneVdb(stem + ".vdb").seen_distance;
   return detail;
 }
 

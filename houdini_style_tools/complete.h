@@ -66,9 +66,10 @@ Scene writePlace(const Place& place, const std::vector<View>& views, const Encod
 /// X.vdb, X.points.vdb and X.ply alone; up is the grid's z.
 void writeScene(const Scene& scene, const std::string& stem, Progress& progress);
 
-/// What views saw of a finished place: the Gaussians of its X.points.vdb that are not generated.
-/// Throws Error where the file is missing, unreadable or has none.
-std::shared_ptr<const Detail> readDetail(const std::string& points_path, const VoxelFrame& frame);
+/// What views saw of a finished place: the Gaussians of `stem`.points.vdb that are not generated,
+/// and what `stem`.vdb has of what they measured. Throws Error where a file is missing or
+/// unreadable, or there are none.
+std::shared_ptr<const Detail> readDetail(const std::string& stem, const VoxelFrame& frame);
 
 struct Rethresholded {
   int64_t voxels = 0, gaussians = 0, dropped_voxels = 0;

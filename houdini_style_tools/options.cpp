@@ -53,6 +53,9 @@ std::vector<Option> detailOptions(DetailSettings* s) {
                  "to spend on making what views saw as sharp as their pixels, counted by a fixed "
                  "cost model; 0: as coarse as the rest")
               .between(0, 3600),
+          option("--detail-voxel METRES", &s->voxel_m,
+                 "of the level set; 0: as fine as the views measured, .01 to .05")
+              .between(0, 1),
           option("--splats N", &s->splats, "at most for what views saw; 0: as its content asks")
               .between(0, 100000000)};
 }

@@ -81,9 +81,9 @@ std::shared_ptr<const TokenMask> allowedTokens(const CompleteOptions& o, const V
   return allowed;
 }
 
-// X.points.vdb of X.latent.vdb.
-std::string pointsBeside(const std::string& latents) {
-  return latents.substr(0, latents.size() - std::strlen(kLatentEnding)) + kPointsEnding;
+// X of X.latent.vdb.
+std::string stemOf(const std::string& latents) {
+  return latents.substr(0, latents.size() - std::strlen(kLatentEnding));
 }
 
 // The place to start from, and the views that it was seen in: none where it is from a file.
@@ -96,9 +96,10 @@ Start readStart(const CompleteOptions& o, const Encoder& encoder, const std::str
                 Progress& progress) {
   if (o.fromLatents()) {
     Place place = readLatents(o.in.views, encoder, weights);
-    const std::string points = pointsBeside(o.in.views);
-    if (!place.cameras.empty() && fs::exists(points) && o.in.settings.detail.seconds > 0)
-      place.detail = readDetail(points, place.frame);
+    const std::string stem = stemOf(o.in.views);
+    const bool is_there = fs::exists(stem + kPointsEnding) && fs::exists(stem + ".vdb");
+    if (!place.cameras.empty() && is_there && o.in.settings.detail.seconds > 0)
+      place.detail = readDetail(stem, place.frame);
     const Eigen::Vector3d up = place.frame.world_from_grid.linear().col(2);
     progress.end();
     return {{{}, settingsOf(o.in, up)}, std::move(place)};
@@ -187,8 +188,8 @@ void printCompletion(const Run& run, const CompleteOptions& o, const std::string
     text += joinText("\n", stem, ".ply: its numbers have steps of ", made["ply_step_m"],
                      " m so far from the world's origin; ", stem, ".points.vdb has none");
   if (o.fromLatents() && made["detail_missing"])
-    text += joinText("\n", pointsBeside(o.in.views),
-                     ": no such file: what views saw is as coarse as the latents have it");
+    text += joinText("\n", stemOf(o.in.views), ".vdb, ", stemOf(o.in.views), kPointsEnding,
+                     ": not both there: what views saw is as coarse as the latents have it");
   if (o.samples > 1)
     text +=
         joinText("\nthe same of ", o.samples - 1, " more with other seeds: ", sampleStem(stem, 2),

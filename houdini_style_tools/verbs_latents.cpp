@@ -22,7 +22,8 @@ void cookEncode(const SceneOptions& o, const Run& run, Progress& progress) {
   const std::string weights = weightsFolder(o.weights);
   const auto start = std::chrono::steady_clock::now();
   progress.start("read");
-  const SceneInput in = readScene(o);
+  SceneInput in = readScene(o);
+  in.settings.detail.seconds = 0;  // latents alone
   const Encoder encoder(weights + "/encoder.safetensors");
   progress.end();
   const Place place =

@@ -16,15 +16,14 @@ constexpr int kBudgetRounds = 8;    // of halving an interval
 constexpr float kLeastShown = .2f;  // pixels; discs of which no view shows more go
 
 // The finest discs that keep to the budget: their gain is found by halving.
-Gaussians discsWithin(const std::vector<SeenImage>& images, int64_t most,
-                      const Eigen::Vector3d& origin) {
+Gaussians discsWithin(const std::vector<SeenImage>& images, int64_t most) {
   DiscSettings settings;
-  Gaussians discs = placeDiscs(images, settings, origin);
+  Gaussians discs = placeDiscs(images, settings);
   if (most == 0 || discs.size() <= most) return discs;
   const auto with = [&](double factor) {
     DiscSettings s;
     s.gain *= factor, s.noise_gain *= factor;
-    return placeDiscs(images, s, origin);
+    return placeDiscs(images, s);
   };
   double low = 0, high = 1;  // binary logarithms
   while (high < 32 && (discs = with(std::exp2(high))).size() > most) low = high, high *= 2;
@@ -69,8 +68,9 @@ Detail seenDetail(const std::vector<View>& views, const DetailSettings& settings
   detail.discs.antialias = true;
   if (views.empty() || settings.seconds == 0) return detail;
   const auto start = std::chrono::steady_clock::now();
-  const std::vector<SeenImage> images = seenImages(views, settings.carving);
-  detail.discs = discsWithin(images, settings.splats, origin);
+  std::vector<SeenImage> images = seenImages(views, settings.carving);
+  for (SeenImage& image : images) image.view.camera = cameraFrom(origin, image.view.camera);
+  detail.discs = discsWithin(images, settings.splats);
   const double step = meanStepSeconds(images, detail.discs.size());
   FitSettings fit;
   fit.steps = int(std::min(double(kMostSteps), settings.seconds / step));
@@ -78,6 +78,7 @@ Detail seenDetail(const std::vector<View>& views, const DetailSettings& settings
   detail.steps = fitGaussians(images, fit, &detail.discs);
   detail.estimated_seconds = detail.steps * step;
   if (detail.steps > 0) detail.discs = withoutUnseen(detail.discs, images, kLeastShown);
+  detail.discs.origin = origin;
   detail.seconds = secondsSince(start);
   return detail;
 }

@@ -1,10 +1,11 @@
 #pragma once
 // What views saw, at the resolution of their pixels: flat Gaussians placed from pictures and depth,
-// then fitted. No network. See docs/method.md, section 3.4.
+// then fitted. No network. See docs/method.md, section 6.3.
 #include <vector>
 
 #include "splat/gaussians.h"
 #include "splat/view.h"
+#include "vdb/grid_instances.h"
 #include "vdb/progress.h"
 
 namespace vdbc {
@@ -13,9 +14,10 @@ struct DetailSettings {
   /// Of fitting, by a fixed cost model (fitSeconds()): the clock never decides what is computed. 0:
   /// nothing is made of the views, and of a little no more than placed. Fitting stops before where
   /// more would not help.
-  double seconds = 1;
+  double seconds = 2;
   /// Of discs, at most; 0: as many as what was seen asks for. Plain walls ask for few.
   int64_t splats = 0;
+  float voxel_m = 0;      // of the level set (FuseSettings)
   CarveSettings carving;  // which pixels have a depth
   uint64_t seed = 1;
 };
@@ -28,6 +30,7 @@ struct Detail {
   Gaussians discs;               // SH degree 0, antialias
   int steps = 0;                 // of fitting that were taken
   double estimated_seconds = 0;  // of them, by fitSeconds()
+  FloatGrid::ConstPtr distance;  // what the views measured (fuseDepth()); null where not asked for
   double seconds = 0;            // that making the discs took
 };
 

@@ -155,7 +155,7 @@ void addDisc(const SeenImage& image, const Patch& patch, const Sums& s, Gaussian
   Matrix3d axes = c.world_from_camera.linear() * svd.matrixU();
   if (axes.determinant() < 0) axes.col(2) *= -1;
   const Eigen::Quaterniond rotation(axes);
-  const Vector3d mean = c.unproject(u, v, 1 / q) - g->origin;
+  const Vector3d mean = c.unproject(u, v, 1 / q);
   if (!mean.allFinite() || !(sigma.minCoeff() > 0) || !sigma.allFinite()) return;
   g->mean.push_back(mean.cast<float>());
   g->log_scale.push_back(sigma.array().log().cast<float>());
@@ -167,7 +167,7 @@ void addDisc(const SeenImage& image, const Patch& patch, const Sums& s, Gaussian
 
 // Discs of the pixels with a weight.
 Gaussians discsOf(const SeenImage& image, const std::vector<float>& weight,
-                  const DiscSettings& settings, const Vector3d& origin) {
+                  const DiscSettings& settings) {
   const SumTable table(image.view.colour, image.q, weight);
   std::vector<std::pair<Patch, Sums>> patches;
   const int w = image.width(), h = image.height(), side = std::max(8, w / 40);
@@ -178,7 +178,6 @@ Gaussians discsOf(const SeenImage& image, const std::vector<float>& weight,
     for (int x = 0; x < w; x += side)
       cutter.cut({x, y, std::min(x + side, w), std::min(y + side, h), {}, false});
   Gaussians g;
-  g.origin = origin;
   g.antialias = true;
   for (const auto& [patch, sums] : patches) addDisc(image, patch, sums, &g);
   return g;
@@ -201,8 +200,7 @@ std::vector<float> gapsOf(const SeenImage& image, const std::vector<float>& own,
 
 }  // namespace
 
-Gaussians placeDiscs(const std::vector<SeenImage>& images, const DiscSettings& settings,
-                     const Vector3d& origin) {
+Gaussians placeDiscs(const std::vector<SeenImage>& images, const DiscSettings& settings) {
   require(settings.gain > 0 && settings.noise_gain >= 0,
           "placeDiscs: expected a positive gain, found ", settings.gain);
   const size_t n = images.size();
@@ -213,14 +211,13 @@ Gaussians placeDiscs(const std::vector<SeenImage>& images, const DiscSettings& s
   };
   tbb::parallel_for(size_t(0), n, [&](size_t i) {
     own[i] = ownPixels(images, i);
-    parts[i] = discsOf(images[i], own[i], settings, origin);
+    parts[i] = discsOf(images[i], own[i], settings);
   });
   Gaussians all;
-  all.origin = origin;
   all.antialias = true;
   append(&all);
   tbb::parallel_for(size_t(0), n, [&](size_t i) {
-    parts[i] = discsOf(images[i], gapsOf(images[i], own[i], all), settings, origin);
+    parts[i] = discsOf(images[i], gapsOf(images[i], own[i], all), settings);
   });
   append(&all);
   return all;

@@ -1,6 +1,6 @@
 #pragma once
 // Private: flat Gaussians on what depth views saw: one disc per patch of about equal content. See
-// docs/method.md, section 3.4.
+// docs/method.md, section 6.3.
 #include <vector>
 
 #include "splat/gaussians.h"
@@ -21,9 +21,8 @@ struct DiscSettings {
 /// takes away from the error of colour and depth is not worth a disc: plain walls get few, shelves
 /// many. A point that several views see belongs to the one that sees it finest; a later view adds
 /// only where the earlier ones left a gap. Holes of the depth continue the planes around them along
-/// like colours. What another view looked through is left out. Means are from `origin`. Parallel
-/// over views; the same bytes for any number of threads.
-Gaussians placeDiscs(const std::vector<SeenImage>& images, const DiscSettings& settings,
-                     const Eigen::Vector3d& origin);
+/// like colours. What another view looked through is left out. Means are in the cameras' world.
+/// Parallel over views; the same bytes for any number of threads.
+Gaussians placeDiscs(const std::vector<SeenImage>& images, const DiscSettings& settings);
 
 }  // namespace vdbc

@@ -1,6 +1,6 @@
 #pragma once
 // Private: Gaussians fitted to the views that they were made of, by a few steps of Adam. See
-// docs/method.md, section 3.4.
+// docs/method.md, section 6.3.
 #include <vector>
 
 #include "splat/gaussians.h"

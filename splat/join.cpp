@@ -106,7 +106,7 @@ Blob merged(const std::vector<Blob>& parts) {
 class Bounds {
  public:
   Bounds(const Gaussians& discs, const std::vector<Camera>& cameras, float slack)
-      : cameras_(cameras), origin_(discs.origin), slack_(slack) {
+      : cameras_(cameras), slack_(slack) {
     RasterSettings raster;
     raster.antialias = discs.antialias, raster.median_depth = true;
     for (const Camera& c : cameras_)
@@ -136,13 +136,13 @@ class Bounds {
   // The mean camera, from the origin.
   Vector3f meanEye() const {
     Vector3d sum = Vector3d::Zero();
-    for (const Camera& c : cameras_) sum += c.world_from_camera.translation() - origin_;
+    for (const Camera& c : cameras_) sum += c.world_from_camera.translation();
     return (sum / double(std::max(size_t(1), cameras_.size()))).cast<float>();
   }
 
  private:
   Vector3d project(size_t view, const Vector3f& p) const {
-    return cameras_[view].project(origin_ + p.cast<double>());
+    return cameras_[view].project(p.cast<double>());
   }
   float depthAt(size_t view, const Vector3d& uvz) const {
     const Camera& c = cameras_[view];
@@ -175,7 +175,6 @@ class Bounds {
   }
 
   const std::vector<Camera>& cameras_;
-  Vector3d origin_;
   float slack_;
   std::vector<std::vector<float>> depths_;  // [H * W] each; 0 where nothing was seen
 };
@@ -324,13 +323,19 @@ std::vector<Blob> voxelBlobs(const Gaussians& g, const Provenance& p, size_t beg
 
 }  // namespace
 
-SplatScene join(const Gaussians& discs, const Gaussians& decoded, const Provenance& provenance,
-                int per_voxel, const std::vector<Camera>& cameras, const JoinSettings& s) {
+SplatScene join(const Gaussians& world_discs, const Gaussians& decoded,
+                const Provenance& provenance, int per_voxel,
+                const std::vector<Camera>& world_cameras, const JoinSettings& s) {
+  // All from one origin, which is then that of the world.
+  Gaussians discs = world_discs;
+  std::vector<Camera> cameras;
+  for (const Camera& c : world_cameras) cameras.push_back(cameraFrom(discs.origin, c));
   require(discs.sh_degree == 0 && decoded.sh_degree == 0 && discs.origin == decoded.origin &&
               provenance.size() == decoded.size() && per_voxel > 0 &&
               decoded.size() % per_voxel == 0,
           "join: expected Gaussians of SH degree 0 from one origin, whole voxels and their "
           "provenance");
+  discs.origin.setZero();
   const Bounds bounds(discs, cameras, s.slack_m);
   const std::vector<SeenPlane> planes = seenPlanes(discs, bounds.meanEye(), s.seed);
   const size_t voxels = size_t(decoded.size() / per_voxel);
@@ -360,9 +365,10 @@ SplatScene join(const Gaussians& discs, const Gaussians& decoded, const Provenan
       if (!(b.generated && bounds.sees(b.mean, s.voxel_m)) && bounds.clip(&b)) kept[v].push_back(b);
   });
   SplatScene scene;
-  scene.gaussians = discs;
-  scene.provenance.generated.assign(size_t(discs.size()), 0);
-  scene.provenance.probability.assign(size_t(discs.size()), 1.f);
+  scene.gaussians = std::move(discs);
+  scene.gaussians.origin = decoded.origin;
+  scene.provenance.generated.assign(scene.gaussians.mean.size(), 0);
+  scene.provenance.probability.assign(scene.gaussians.mean.size(), 1.f);
   for (const auto& blobs : kept)
     for (const Blob& b : blobs) appendBlob(b, &scene);
   return scene;

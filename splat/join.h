@@ -1,5 +1,5 @@
 #pragma once
-// What completion made, joined with what the views saw. See docs/method.md, section 3.5.
+// What completion made, joined with what the views saw. See docs/method.md, section 6.4.
 #include <vector>
 
 #include "splat/points_vdb.h"

@@ -7,9 +7,9 @@
 #include <cmath>
 #include <random>
 
-#include "expect_error.h"
 #include "splat/join.h"
 #include "splat/rasterize.h"
+#include "tests/expect_error.h"
 #include "vdb/threads.h"
 
 namespace vdbc {

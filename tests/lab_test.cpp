@@ -113,10 +113,10 @@ TEST_F(Lab, EvalReconstructNeedsOnlyTheEncoder) {
     }
     EXPECT_EQ(result.at("decode_seconds").is_null(), result.at("method") != "reconstructed");
   }
-  EXPECT_EQ(methods, (Args{"reconstructed", "voxel-mean", "pixel-aligned", "optimised", "mean",
-                           "mean", "mean", "mean"}));
+  EXPECT_EQ(methods, (Args{"reconstructed", "detail", "voxel-mean", "pixel-aligned", "optimised",
+                           "mean", "mean", "mean", "mean", "mean"}));
   const Image sheet = readImage(at("pictures/0.png"));
-  EXPECT_EQ(sheet.width % 5, 0);   // the truth and four methods
+  EXPECT_EQ(sheet.width % 6, 0);   // the truth and five methods
   EXPECT_EQ(sheet.height % 3, 0);  // two input views and the one other
 }
 

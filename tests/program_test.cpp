@@ -286,8 +286,8 @@ TEST_F(Program, ObservedVoxelsAreTheCarvedViews) {
     EXPECT_GE(progress.at("percent").get<int>(), 0);
     EXPECT_LE(progress.at("percent").get<int>(), 100);
   }
-  EXPECT_EQ(stages,
-            (std::set<std::string>{"carve", "complete", "decode", "encode", "read", "write"}));
+  EXPECT_EQ(stages, (std::set<std::string>{"carve", "complete", "decode", "detail", "encode",
+                                           "read", "write"}));
 }
 
 TEST_F(Program, AScanCutInHalfCompletes) {
@@ -421,8 +421,16 @@ TEST_F(Program, LatentsOfACompletionAreCompletedAgain) {
   // The same run from encoded latents: the same bytes.
   EXPECT_EQ(again({}).z, before.z);
   EXPECT_EQ(listing(at("y")), (Args{"y.latent.vdb", "y.ply", "y.points.vdb", "y.vdb"}));
-  for (const char* ending : {".ply", ".points.vdb", ".latent.vdb"})
-    EXPECT_TRUE(readText(at("y/y") + ending) == readText(output_ + "/x" + ending)) << ending;
+  EXPECT_TRUE(readText(at("y/y.latent.vdb")) == readText(latents));
+  // What views saw is found in the files, as exact as they hold it.
+  const auto observed = [](const std::string& points) {
+    Provenance provenance;
+    readPointsVdb(points, &provenance);
+    return std::count(provenance.generated.begin(), provenance.generated.end(), uint8_t(0));
+  };
+  EXPECT_EQ(observed(at("y/y.points.vdb")), observed(output_ + "/x.points.vdb"));
+  EXPECT_EQ(readSceneVdb(at("y/y.vdb")).seen_distance->activeVoxelCount(),
+            readSceneVdb(output_ + "/x.vdb").seen_distance->activeVoxelCount());
   // Levels below the given one stay, whatever tau is, the others are made anew.
   const Place other =
       again({"--from-level", "2", "--sampling-steps", "2", "--seed", "9", "--tau", ".6"});

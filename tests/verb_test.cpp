@@ -300,11 +300,12 @@ std::set<std::string> namesOf(const std::vector<Option>& options) {
 // A new option belongs to growthOptions(), and so to the identity, or here.
 TEST(Identity, HasEveryOptionButThoseThatChangeNoGrowth) {
   const std::set<std::string> others = {
-      "VIEWS",       "--output",    "--frames",  "--bounds",
-      "--up",        "--scale",     "--margin",                // the start
-      "--region",    "--lock",                                 // their content
-      "--weights",                                             // the networks' hashes
-      "--child-tau", "--antialias", "--samples", "--resume"};  // after, or around, the growth
+      "VIEWS",       "--output",       "--frames",  "--bounds",
+      "--up",        "--scale",        "--margin",                // the start
+      "--detail",    "--detail-voxel", "--splats",                // what was seen
+      "--region",    "--lock",                                    // their content
+      "--weights",                                                // the networks' hashes
+      "--child-tau", "--antialias",    "--samples", "--resume"};  // after, or around, the growth
   CompleteSettings settings;
   std::set<std::string> expected = namesOf(identityOptions(&settings));
   EXPECT_EQ(expected.erase("--seed"), 1u);  // of every verb

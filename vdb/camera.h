@@ -44,6 +44,15 @@ inline Eigen::Isometry3d lookAt(const Eigen::Vector3d& eye, const Eigen::Vector3
   return world_from_camera;
 }
 
+/// The camera with places counted from `origin`, to a 2^20th of a metre: the same one for the same
+/// place, wherever in the world it lies.
+inline Camera cameraFrom(const Eigen::Vector3d& origin, Camera camera) {
+  constexpr double kSteps = 1 << 20;
+  const Eigen::Vector3d eye = (camera.world_from_camera.translation() - origin) * kSteps;
+  camera.world_from_camera.translation() = eye.array().round() / kSteps;
+  return camera;
+}
+
 /// The same camera for an image resized to width x height.
 inline Camera resized(const Camera& camera, int width, int height) {
   Camera c = camera;

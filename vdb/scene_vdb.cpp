@@ -8,7 +8,7 @@
 #include <array>
 #include <cmath>
 
-#include "vdb/grid_instances.h"
+#include "vdb/fuse.h"
 #include "vdb/vdb_file.h"
 
 namespace vdbc {
@@ -20,6 +20,7 @@ constexpr int kBandVoxels = 3;  // half width of `surface`
 constexpr const char* kSurface = "surface";
 constexpr const char* kGenerated = "generated";
 constexpr const char* kSeenEmpty = "seen_empty";
+constexpr const char* kSeenDistance = "seen_distance";
 
 // The grid that holds a column, and its values as the grid has them and back.
 template <typename Value>
@@ -159,22 +160,53 @@ void requireWritable(const SceneVoxels& v, const std::string& path) {
   }
 }
 
+// What is solid: what stands where views saw nothing is made up and wrong.
+std::vector<Coord> solidVoxels(const SceneVoxels& v) {
+  std::vector<Coord> solid;
+  const openvdb::tree::ValueAccessor<const TokenMask, false> empty(v.empty);
+  for (size_t i = 0; i < v.ijk.size(); ++i)
+    if (v.observed[i] || !empty.isValueOn(v.ijk[i])) solid.push_back(v.ijk[i]);
+  return solid;
+}
+
+FloatGrid::Ptr surfaceOf(const SceneVoxels& v) {
+  const std::vector<Coord> solid = solidVoxels(v);
+  if (v.seen_distance) return closedSurface(v.frame, solid, *v.seen_distance);
+  MaskTree mask;
+  openvdb::tree::ValueAccessor<MaskTree, false> cells(mask);
+  for (const Coord& ijk : solid) cells.setValueOn(ijk);
+  return boundaryLevelSet(mask, double(v.frame.voxel_m));
+}
+
+// A distance grid of another program's making may hold anything.
+FloatGrid::ConstPtr checkedDistance(const char* operation, const FloatGrid::Ptr& grid,
+                                    const VoxelFrame& frame, const std::string& path) {
+  const int parts = detailPartsOf(frame, *grid);
+  VoxelFrame detail = frame;
+  detail.voxel_m = frame.voxel_m / float(parts);
+  const openvdb::Mat4d expected = fileTransform(detail)->baseMap()->getAffineMap()->getMat4(),
+                       found = grid->transform().baseMap()->getAffineMap()->getMat4();
+  double off = 0;
+  for (int row = 0; row < 4; ++row)
+    for (int col = 0; col < 4; ++col)
+      off = std::max(off, std::abs(expected[row][col] - found[row][col]));
+  require(off < 1e-6 * std::max(1., frame.world_from_grid.translation().cwiseAbs().maxCoeff()),
+          operation, ": ", path, ": grid '", kSeenDistance, "' does not lie in the volume's frame");
+  const float most = 1.01f * float(kDetailBand) * detail.voxel_m;
+  for (auto value = grid->cbeginValueOn(); value; ++value)
+    require(std::abs(*value) <= most, operation, ": ", path, ": voxel ", value.getCoord(), " of '",
+            kSeenDistance, "' has a value that makes no sense");
+  return grid;
+}
+
 }  // namespace
 
 void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
   requireWritable(voxels, path);
   openvdb::initialize();
 
-  MaskTree solid;
-  {
-    openvdb::tree::ValueAccessor<MaskTree, false> cells(solid);
-    const openvdb::tree::ValueAccessor<const TokenMask, false> empty(voxels.empty);
-    for (size_t i = 0; i < voxels.ijk.size(); ++i)
-      if (voxels.observed[i] || !empty.isValueOn(voxels.ijk[i])) cells.setValueOn(voxels.ijk[i]);
-  }
   const auto& v = voxels;
-  std::vector<std::pair<const char*, openvdb::GridBase::Ptr>> named = {
-      {kSurface, boundaryLevelSet(solid, double(v.frame.voxel_m))}};
+  std::vector<std::pair<const char*, openvdb::GridBase::Ptr>> named = {{kSurface, surfaceOf(v)}};
   forEachColumn(
       [&](const auto& c) {
         using Value = typename std::decay_t<decltype(c)>::Value;
@@ -189,6 +221,11 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
         }
       },
       v);
+  if (v.seen_distance) {
+    const auto distance = FloatGrid::create(*v.seen_distance);  // shares the tree
+    distance->setSaveFloatAsHalf(true), named[0].second->setSaveFloatAsHalf(true);
+    named.emplace_back(kSeenDistance, distance);
+  }
   named[1].second->setGridClass(openvdb::GRID_FOG_VOLUME);  // `density` is the first column
   // Where a tool wants to mask by what was made up, it should not have to invert a grid.
   named.insert(
@@ -200,7 +237,9 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
   for (const auto& [name, grid] : named) {
     grid->setName(name);
     grid->setCreator("vdb_complete");
-    grid->setTransform(transform);  // one object: OpenVDB keeps it by pointer
+    // One object: OpenVDB keeps it by pointer. The detail voxels' grids have their own.
+    const bool is_detail = v.seen_distance && (name == kSurface || name == kSeenDistance);
+    if (!is_detail) grid->setTransform(transform);
     grids.push_back(grid);
   }
   const auto observed =
@@ -252,8 +291,10 @@ SceneVoxels readSceneVdb(const std::string& path) {
   const auto density = findGrid<FloatGrid>(kOperation, grids, "density", path);
   const auto empty = findGrid<BoolGrid>(kOperation, grids, kSeenEmpty, path);
   for (const openvdb::GridBase::Ptr& grid : grids)
-    require(grid->transform() == density->transform(), "readSceneVdb: ", path, ": grid '",
-            grid->getName(), "' has another transform than 'density'");
+    require(grid->getName() == kSurface || grid->getName() == kSeenDistance ||
+                grid->transform() == density->transform(),
+            "readSceneVdb: ", path, ": grid '", grid->getName(),
+            "' has another transform than 'density'");
 
   SceneVoxels voxels;
   voxels.frame = readVolume(kOperation, metadata, density->transform(), 0, path);
@@ -286,6 +327,11 @@ SceneVoxels readSceneVdb(const std::string& path) {
       },
       voxels);
   voxels.empty.root() = maskOfGrid(kOperation, *empty, voxels.frame.bounds, path).root();
+  for (const openvdb::GridBase::Ptr& grid : grids)
+    if (grid->getName() == kSeenDistance)
+      voxels.seen_distance =
+          checkedDistance(kOperation, findGrid<FloatGrid>(kOperation, grids, kSeenDistance, path),
+                          voxels.frame, path);
   return voxels;
 }
 

@@ -5,6 +5,7 @@
 
 #include "vdb/carve.h"
 #include "vdb/columns.h"
+#include "vdb/grid_instances.h"
 
 namespace vdbc {
 
@@ -18,6 +19,8 @@ struct SceneVoxels {
   std::vector<float> probability;  // its token's, which tau is compared with; 1 for observed
   std::vector<int32_t> bfs_level;  // growth level, 0 for observed
   TokenMask empty;                 // E of the input views (kept open in `surface`)
+  /// What the views measured, in detail voxels (fuseDepth()); null where that is not known.
+  FloatGrid::ConstPtr seen_distance;
 
   int64_t size() const { return int64_t(ijk.size()); }
 
@@ -33,7 +36,8 @@ struct SceneVoxels {
 /// (bool), probability, bfs_level (float), seen_empty (bool); world transform with the grid's
 /// rotation; metadata as docs/formats.md says. Voxel ijk's centre is at ijk + 0.5 in frame units:
 /// the file's transform has the half-voxel shift so that grid index space is cell-centred.
-/// `surface` is the exact distance to the boundary of the voxels; generated ones that lie in
+/// `surface`: with `seen_distance`, which is written too, closedSurface() in its detail voxels;
+/// else the exact distance to the boundary of the voxels. Generated ones that lie in
 /// `empty` are left out of it. A checksum follows what OpenVDB reads. Written to a temporary name
 /// and renamed. Throws Error for voxels outside the bounds, twice the same, or with values that are
 /// not finite, and where the file cannot be written.

@@ -54,7 +54,8 @@ struct Volume {
   CoordBBox bounds;       // of the cells
   Vec3SGrid::Ptr colour;  // scene-linear, may be null
   Eigen::Affine3d colour_from_world;
-  BoolGrid::Ptr seen_empty;  // with the field's transform, may be null
+  BoolGrid::Ptr seen_empty;  // may be null
+  Eigen::Affine3d empty_from_world;
   Vector3d up;
 
   /// Positive in free space, negative in the solid; near the surface of a level set in voxels.
@@ -233,9 +234,7 @@ Volume loadVolume(const std::string& path) {
   }
   if (has("seen_empty")) {
     v.seen_empty = findGrid<BoolGrid>(kReadViews, file.grids, "seen_empty", path);
-    require(worldFromIndex(v.seen_empty->transform(), path).isApprox(v.world_from_index, 1e-6),
-            kReadViews, ": ", path, ": grid 'seen_empty' has another transform than '",
-            v.field->getName(), "'");
+    v.empty_from_world = worldFromIndex(v.seen_empty->transform(), path).inverse();
   }
   return v;
 }
@@ -403,8 +402,11 @@ std::vector<Vector3d> freePlaces(const Volume& volume) {
           volume.bounds.min()[axis] + double(random() >> 11) * 0x1p-53 * volume.bounds.dim()[axis];
     // Clear of the surface, all corners of the point's cell are at its side.
     if (!caster.isFree(Coord::floor(p)) || !isClear(p)) continue;
-    if (volume.seen_empty && !volume.seen_empty->tree().isValueOn(Coord::round(p))) continue;
-    places.push_back(volume.world_from_index * Vector3d(p.x(), p.y(), p.z()));
+    const Vector3d world = volume.world_from_index * Vector3d(p.x(), p.y(), p.z());
+    const Vector3d empty = volume.seen_empty ? volume.empty_from_world * world : world;
+    if (volume.seen_empty && !volume.seen_empty->tree().isValueOn(Coord::round(vdbVector(empty))))
+      continue;
+    places.push_back(world);
   }
   return places;
 }

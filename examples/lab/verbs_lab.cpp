@@ -167,6 +167,7 @@ Verb evalVerb() {
              option("--pictures FOLDER", &o->pictures,
                     "for N.png of scene N; columns: truth, observed, nearest, box, completed, "
                     "oracle occupancy (--reconstruct: truth, reconstruction, baselines)")}},
+           {"What was seen", detailOptions(&o->settings.detail)},
            completion,
            {"The encoder-decoder alone",
             {flag("--reconstruct", &o->reconstruct,
