@@ -21,8 +21,11 @@ constexpr double kFinest = .01, kCoarsest = .05;  // metres
 constexpr int kCell = 4;                          // pixels over whose means slopes are taken
 constexpr double kSameSurface = .03;              // of 1/z: neighbours within are one surface
 constexpr double kLeastCosine = .1;
-constexpr float kDistanceSteps = 96;  // of the band
+constexpr float kDistanceSteps = 48;  // of the band
 constexpr float kShell = .67f;        // of the band: how thick at least what was measured is
+
+// Round distances make small files.
+float roundedTo(float step, float distance) { return std::round(distance / step) * step; }
 
 // --- what a view measured -----------------------------------------------------------------------
 
@@ -104,7 +107,9 @@ FuseView fuseView(const DepthView& view, const VoxelFrame& frame, const CarveSet
   FuseView v;
   v.camera = view.camera;
   const Camera local = cameraFrom(frame.world_from_grid.translation(), view.camera);
-  v.camera_from_grid = local.world_from_camera.inverse() * frame.world_from_grid.linear();
+  Eigen::Isometry3d origin_from_grid = Eigen::Isometry3d::Identity();
+  origin_from_grid.linear() = frame.world_from_grid.linear();
+  v.camera_from_grid = local.world_from_camera.inverse() * origin_from_grid;
   v.q = usableDepth(view, carving);
   for (float& q : v.q) q = q > 0 ? 1 / q : 0;
   v.cells_x = view.camera.width / kCell, v.cells_y = view.camera.height / kCell;
@@ -252,8 +257,9 @@ Leaf* fuseLeaf(const VoxelFrame& detail, const Coord& origin, const std::vector<
   }
   if (!any) return nullptr;
   auto* leaf = new Leaf(origin, float(band), false);
+  const float step = float(band) / kDistanceSteps;
   for (openvdb::Index n = 0; n < Leaf::SIZE; ++n)
-    if (voxels[n].any()) leaf->setValueOn(n, voxels[n].distance(float(band)));
+    if (voxels[n].any()) leaf->setValueOn(n, roundedTo(step, voxels[n].distance(float(band))));
   if (leaf->isEmpty()) {
     delete leaf;
     return nullptr;
@@ -390,7 +396,7 @@ void keepBand(FloatGrid* grid) {
   for (size_t i = 0; i < leaves.size(); ++i) leaves[i]->setValueMask(masks[i]);
 }
 
-// Only the band stays active; what is beyond has its sign. Round distances make small files.
+// Only the band stays active; what is beyond has its sign.
 void trimBand(float band, FloatGrid* grid) {
   const float step = band / kDistanceSteps;
   std::vector<Leaf*> leaves;
@@ -399,7 +405,7 @@ void trimBand(float band, FloatGrid* grid) {
     for (openvdb::Index n = 0; n < Leaf::SIZE; ++n) {
       const float d = leaves[i]->getValue(n);
       if (leaves[i]->isValueOn(n) && std::abs(d) < band)
-        leaves[i]->setValueOnly(n, std::round(d / step) * step);
+        leaves[i]->setValueOnly(n, roundedTo(step, d));
       else
         leaves[i]->setValueOff(n, d < 0 ? -band : band);
     }

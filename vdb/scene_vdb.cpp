@@ -222,7 +222,7 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
       },
       v);
   if (v.seen_distance) {
-    const auto distance = FloatGrid::create(*v.seen_distance);  // shares the tree
+    const FloatGrid::Ptr distance = v.seen_distance->deepCopy();
     distance->setSaveFloatAsHalf(true), named[0].second->setSaveFloatAsHalf(true);
     named.emplace_back(kSeenDistance, distance);
   }
