@@ -15,7 +15,7 @@ job() {
   name="$1 $2" seconds=$2 scenes=$3 views=$4
   shift 4
   [ -s "$folder/$name.jsonl" ] ||
-    "$lab" eval --reconstruct --scenes "$scenes" --views "$views" --detail "$seconds" "$@" --json \
+    "$lab" eval --reconstruct --scenes "$scenes" --views "$views" --detail "$seconds" --optimise 0 "$@" --json \
       2>>"$folder/log" >"$folder/$name.draft"
   [ -s "$folder/$name.jsonl" ] || mv "$folder/$name.draft" "$folder/$name.jsonl"
   jobs="$jobs$name=$folder/$name.jsonl
@@ -30,7 +30,7 @@ if [ -d "$data/rgbd_redkitchen" ]; then
     job kitchen-12 $seconds "$data/rgbd_redkitchen" 12 --frames 0,2,4,6,8,10,12,14,16,18,20,22
   done
 fi
-compare "$jobs" --method detail --scores input_psnr other_psnr other_ssim other_flip encode_seconds gaussians \
+compare "$jobs" --method detail --scores input_psnr other_seen_psnr other_psnr other_ssim other_flip encode_seconds \
   --csv "$results/detail.csv"
 cd "$results"
 gnuplot <<'PLOT'
@@ -45,5 +45,5 @@ set xlabel "seconds from views to discs"; set ylabel "PSNR [dB]"
 set title "Where views saw: input views"
 plot for [kind in "rooms-2 rooms-4 rooms-12 kitchen-4 kitchen-12"] "detail.csv" using (at(kind)):(of(kind, "input_psnr")) with linespoints title kind
 set title "Where views saw: other views"
-plot for [kind in "rooms-2 rooms-4 rooms-12 kitchen-4 kitchen-12"] "detail.csv" using (at(kind)):(of(kind, "other_psnr")) with linespoints title kind
+plot for [kind in "rooms-2 rooms-4 rooms-12 kitchen-4 kitchen-12"] "detail.csv" using (at(kind)):(of(kind, "other_seen_psnr")) with linespoints title kind
 PLOT

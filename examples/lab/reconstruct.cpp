@@ -38,6 +38,32 @@ JudgedViews judged(std::vector<View> views, const Observation& o, int level,
   return j;
 }
 
+constexpr double kSeenWithin = .05;  // metres
+
+// The same views, with the pixels whose point one of `input` measured.
+JudgedViews measuredPart(const JudgedViews& all, const std::vector<View>& input) {
+  JudgedViews part = all;
+  for (size_t v = 0; v < part.views.size(); ++v) {
+    const View& view = part.views[v];
+    const int w = view.camera.width;
+    for (size_t i = 0; i < part.observed[v].size(); ++i) {
+      if (!part.observed[v][i]) continue;
+      const Eigen::Vector3d point = view.camera.unproject(
+          double(int(i) % w) + .5, double(int(i) / w) + .5, double(view.depth[i]));
+      part.observed[v][i] = std::any_of(input.begin(), input.end(), [&](const View& other) {
+        const Eigen::Vector3d uvz = other.camera.project(point);
+        if (!(uvz.z() > 0) || !(uvz.x() >= 0) || !(uvz.y() >= 0) ||
+            !(uvz.x() < other.camera.width) || !(uvz.y() < other.camera.height))
+          return false;
+        const float depth =
+            other.depth[size_t(uvz.y()) * size_t(other.camera.width) + size_t(uvz.x())];
+        return depth > 0 && std::abs(double(depth) - uvz.z()) < kSeenWithin;
+      });
+    }
+  }
+  return part;
+}
+
 // At most kTargetViews, spread evenly.
 std::vector<View> fewOf(const std::vector<View>& all) {
   const size_t n = std::min(all.size(), size_t(kTargetViews));
@@ -86,6 +112,7 @@ const std::vector<Score<ReconstructionResult>> kScores = {
     {"other_psnr", &ReconstructionResult::other_psnr},
     {"other_ssim", &ReconstructionResult::other_ssim},
     {"other_flip", &ReconstructionResult::other_flip},
+    {"other_seen_psnr", &ReconstructionResult::other_seen_psnr},
     {"voxel_precision", &ReconstructionResult::voxel_precision},
     {"voxel_recall", &ReconstructionResult::voxel_recall},
     {"voxel_f1", &ReconstructionResult::voxel_f1},
@@ -210,6 +237,7 @@ std::vector<ReconstructionResult> evaluateReconstruction(
 
   const JudgedViews input = judged(scene.input, o, level, s.observing.carving);
   const JudgedViews others = judged(fewOf(scene.targets), o, level, s.observing.carving);
+  const JudgedViews others_seen = measuredPart(others, scene.input);
   std::vector<ReconstructionResult> results;
   std::vector<std::vector<Image>> columns(1);
   for (const JudgedViews* j : {&input, &others})
@@ -225,6 +253,7 @@ std::vector<ReconstructionResult> evaluateReconstruction(
     const PictureError a = meanError(input, gaussians, kShownViews, &columns.back());
     const PictureError b = meanError(others, gaussians, kShownViews, &columns.back());
     r.input_psnr = a.psnr, r.input_ssim = a.ssim, r.input_flip = a.flip;
+    r.other_seen_psnr = meanError(others_seen, gaussians, 0, nullptr).psnr;
     r.other_psnr = b.psnr, r.other_ssim = b.ssim, r.other_flip = b.flip;
     r.voxel_precision = r.voxel_recall = r.voxel_f1 = r.node_precision = r.node_recall = r.node_f1 =
         kNan;

@@ -19,6 +19,9 @@ struct ReconstructionResult {
   // pixels are left out.
   double input_psnr = 0, input_ssim = 0, input_flip = 0;
   double other_psnr = 0, other_ssim = 0, other_flip = 0;
+  // The same PSNR over those pixels of the others whose point an input view measured to 5 cm: what
+  // lies beside it in an observed token is left out.
+  double other_seen_psnr = 0;
   // splitScores(): voxels; nodes of level 1, where the encoder's latents are on level 2.
   double voxel_precision = 0, voxel_recall = 0, voxel_f1 = 0;
   double node_precision = 0, node_recall = 0, node_f1 = 0;
