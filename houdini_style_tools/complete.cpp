@@ -1,5 +1,6 @@
 #include "houdini_style_tools/complete.h"
 
+#include <tbb/parallel_for.h>
 #include <tbb/parallel_for_each.h>
 
 #include <algorithm>
@@ -190,7 +191,11 @@ void writeTogether(const Writers& writers, const std::string& stem, Progress& pr
   try {
     std::atomic<size_t> written{0};
     tbb::parallel_for_each(writers, [&](const auto& writer) {
-      writer.second(draft + writer.first);
+      // A writer that was interrupted must not cancel the loops within the others: they would go on
+      // with half of their work.
+      tbb::task_group_context alone(tbb::task_group_context::isolated);
+      tbb::parallel_for(
+          0, 1, [&](int) { writer.second(draft + writer.first); }, alone);
       report(progress, int(100 * ++written / writers.size()));
     });
     for (; placed < writers.size(); ++placed)

@@ -267,7 +267,7 @@ TEST(Join, WhatNoViewSawStaysAsOneGaussianAVoxel) {
 
 TEST(Join, SeenPlanesGoOnAsDiscsInThem) {
   const std::vector<View> views = boxViews();
-  const Gaussians discs = discsOf(views, .2);
+  const Gaussians discs = discsOf(views, 1e-9);  // exactly on the planes
   // The checkerboard's wall goes on where no view looked, 4 cm off.
   const Joined j = joinWith({{{.04f, 1.7f, 2.55f}, true}}, discs, views);
   ASSERT_EQ(j.scene.gaussians.size(), discs.size() + 1);
