@@ -89,6 +89,12 @@ void findCosines(FuseView* v) {
     }
 }
 
+double median(std::vector<double>* values) {
+  const auto middle = values->begin() + std::ptrdiff_t(values->size() / 2);
+  std::nth_element(values->begin(), middle, values->end());
+  return *middle;
+}
+
 // Second differences of 1/z vanish on planes: sigma from their median, along rows.
 double noiseOf(const FuseView& v) {
   std::vector<double> second;
@@ -97,10 +103,7 @@ double noiseOf(const FuseView& v) {
       if (v.at(x - 1, y) > 0 && v.at(x, y) > 0 && v.at(x + 1, y) > 0)
         second.push_back(
             std::abs(double(v.at(x - 1, y)) - 2 * double(v.at(x, y)) + double(v.at(x + 1, y))));
-  if (second.empty()) return 0;
-  const auto middle = second.begin() + std::ptrdiff_t(second.size() / 2);
-  std::nth_element(second.begin(), middle, second.end());
-  return *middle / (.6745 * std::sqrt(6.));
+  return second.empty() ? 0 : median(&second) / (.6745 * std::sqrt(6.));
 }
 
 FuseView fuseView(const DepthView& view, const VoxelFrame& frame, const CarveSettings& carving) {
@@ -131,9 +134,7 @@ int partsOf(const VoxelFrame& frame, const std::vector<FuseView>& views, float g
               std::max(kPixelsAVoxel * z / v.camera.fx, kSigmasAVoxel * v.noise * z * z));
         }
     require(!edges.empty(), "fuseDepth: expected a view with a usable depth, found none");
-    const auto middle = edges.begin() + std::ptrdiff_t(edges.size() / 2);
-    std::nth_element(edges.begin(), middle, edges.end());
-    edge = std::clamp(*middle, kFinest, kCoarsest);
+    edge = std::clamp(median(&edges), kFinest, kCoarsest);
   }
   require(std::isfinite(edge) && edge > 0 && edge <= double(frame.voxel_m) * 1.0001,
           "fuseDepth: expected detail voxels of at most ", frame.voxel_m, " m, found ", edge);
