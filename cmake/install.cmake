@@ -4,10 +4,11 @@ include(GNUInstallDirs)
 include(CMakePackageConfigHelpers)
 
 target_sources(vdbc_core PUBLIC FILE_SET HEADERS BASE_DIRS ${PROJECT_SOURCE_DIR} FILES
-  vdb/camera.h vdb/carve.h vdb/columns.h vdb/error.h vdb/fit_volume.h vdb/frame.h vdb/frontier.h vdb/fuse.h vdb/grid_instances.h vdb/latent_vdb.h
-  vdb/mask_vdb.h vdb/place.h vdb/progress.h vdb/scene_vdb.h vdb/seen.h vdb/threads.h vdb/token_grid.h vdb/token_map.h
-  splat/detail.h splat/exr.h splat/gaussians.h splat/image.h splat/image_files.h splat/join.h splat/metrics.h splat/ply.h splat/points_vdb.h
-  splat/rasterize.h splat/rays.h splat/view.h
+  vdb/camera.h vdb/carve.h vdb/columns.h vdb/error.h vdb/fit_volume.h vdb/frame.h vdb/frontier.h vdb/fuse.h
+  vdb/grid_instances.h vdb/latent_vdb.h vdb/mask_vdb.h vdb/place.h vdb/progress.h vdb/scene_vdb.h vdb/seen.h
+  vdb/threads.h vdb/token_grid.h vdb/token_map.h
+  splat/detail.h splat/detail_grids.h splat/exr.h splat/gaussians.h splat/image.h splat/image_files.h splat/join.h
+  splat/metrics.h splat/ply.h splat/points_vdb.h splat/rasterize.h splat/rays.h splat/view.h
   encoder/views/read_views.h)
 set(core_libraries vdbc_core)
 if(VDBC_NN)
@@ -37,7 +38,7 @@ foreach(part core tools)
   endif()
 endforeach()
 
-set(weights_dir ${CMAKE_INSTALL_DATADIR}/vdb_complete/weights/small)
+set(weights_dir ${CMAKE_INSTALL_DATADIR}/vdb_complete/weights/indoor)
 configure_package_config_file(cmake/vdb_complete-config.cmake.in vdb_complete-config.cmake
   INSTALL_DESTINATION ${package_dir} PATH_VARS weights_dir)
 write_basic_package_version_file(vdb_complete-config-version.cmake COMPATIBILITY SameMinorVersion)
@@ -48,7 +49,7 @@ install(FILES cmake/vdb_complete-openvdb.cmake ${PROJECT_BINARY_DIR}/vdb_complet
 if(VDBC_NN)
   set_target_properties(vdb_complete PROPERTIES INSTALL_RPATH "$ORIGIN/../${CMAKE_INSTALL_LIBDIR}")
   install(TARGETS vdb_complete RUNTIME COMPONENT program)
-  install(DIRECTORY weights/small/ DESTINATION ${weights_dir} COMPONENT program)
+  install(DIRECTORY weights/indoor/ DESTINATION ${weights_dir} COMPONENT program)
   install(FILES docs/ATTRIBUTION.md DESTINATION ${CMAKE_INSTALL_DOCDIR} COMPONENT program)
   install(FILES LICENSE RENAME copyright DESTINATION ${CMAKE_INSTALL_DOCDIR} COMPONENT program)
 endif()

@@ -10,6 +10,7 @@
 #include <filesystem>
 #include <functional>
 
+#include "splat/detail_grids.h"
 #include "splat/image_files.h"
 #include "splat/ply.h"
 #include "splat/rasterize.h"
@@ -39,9 +40,13 @@ std::shared_ptr<const Detail> detailOf(const std::vector<View>& views, const Pla
 
 Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
                   const SceneSettings& settings, Progress& progress) {
+  const ObserveSettings observing = encoder.observing(settings.observing);
+  if (settings.detail.voxel_m > observing.volume.voxel_m)
+    throw UsageError(joinText("detail: expected detail voxels of at most ",
+                              observing.volume.voxel_m, " m, found ", settings.detail.voxel_m));
   return withThreads(settings.threads, [&] {
     progress.start("carve");
-    const Observation observation = observe(views, encoder.observing(settings.observing), progress);
+    const Observation observation = observe(views, observing, progress);
     progress.end();
     progress.start("encode");
     Place place = encoder.encode(views, observation, progress);
@@ -217,7 +222,9 @@ Writers sceneWriters(const Scene& scene, const Eigen::Vector3d& up) {
        [&](const std::string& path) { writePointsVdb(gaussians, scene.splats.provenance, path); }},
       {".ply",
        [&gaussians, up](const std::string& path) { writePly(gaussians, path, up.cast<float>()); }},
-      {".vdb", [&](const std::string& path) { writeSceneVdb(scene.voxels, path); }}};
+      {".vdb", [&](const std::string& path) {
+         writeSceneVdb(scene.voxels, path, detailGrids(scene.voxels, gaussians));
+       }}};
 }
 
 Eigen::Vector3d upOf(const VoxelFrame& frame) { return frame.world_from_grid.linear().col(2); }

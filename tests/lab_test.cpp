@@ -74,20 +74,27 @@ TEST_F(Lab, EvalPrintsEveryMethodOnce) {
     for (const char* of_truth :
          {"f1", "iou", "shell_recall", "furniture_recall", "outside", "ece", "leak"})
       EXPECT_TRUE(result.at(of_truth).is_null()) << of_truth;
+    // Judged by the other views.
+    for (const char* share : {"near_recall", "near_f1", "blocked", "right", "behind", "open"}) {
+      EXPECT_GE(result.at(share).get<double>(), 0) << share;
+      EXPECT_LE(result.at(share).get<double>(), 1) << share;
+    }
     if (result.at("method") != "box") {
       EXPECT_GT(result.at("depth_rmse_m").get<double>(), result.at("depth_median_m").get<double>());
       EXPECT_GT(result.at("depth_share").get<double>(), 0);
     }
   }
   const std::map<std::string, int> once = {
-      {"box", 1},     {"completed", 1}, {"completed-tau-0.2", 1}, {"completed-tau-0.75", 1},
-      {"nearest", 1}, {"observed", 1},  {"pixel-aligned", 1}};
+      {"box", 1},          {"completed", 1}, {"completed-tau-0.2", 1}, {"completed-tau-0.75", 1},
+      {"nearest", 1},      {"observed", 1},  {"oracle-latents", 1},    {"oracle-occupancy", 1},
+      {"pixel-aligned", 1}};
   EXPECT_EQ(scene, once);
   EXPECT_EQ(mean, once);
   const Image sheet = readImage(at("pictures/0.png"));
   const View view = readViews(folder).front();
-  EXPECT_EQ(sheet.width, 5 * view.camera.width);  // truth, observed, nearest, box, completed
-  EXPECT_EQ(sheet.height, view.camera.height);    // the one other view
+  // Truth, observed, nearest, box, completed and both oracles; the one other view.
+  EXPECT_EQ(sheet.width, 7 * view.camera.width);
+  EXPECT_EQ(sheet.height, view.camera.height);
   expectFailure({"eval", "--scenes", folder, "--views", "3", "--weights", VDBC_WEIGHTS}, kFailed,
                 folder);
 }

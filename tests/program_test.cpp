@@ -1,6 +1,9 @@
 // vdb_complete as its users meet it.
 #include "tests/program.h"
 
+#include "vdb/fuse.h"
+#include "vdb/vdb_file.h"
+
 namespace vdbc {
 namespace {
 
@@ -528,8 +531,8 @@ TEST_F(Program, RethresholdDropsWhatIsLessProbable) {
   const float limit = std::stof(std::to_string(tau));
   for (size_t i = 0; i < before.ijk.size(); ++i)
     if (before.observed[i] || before.probability[i] > limit)
-      expected[before.ijk[i]] = before.density[i];
-  for (size_t i = 0; i < after.ijk.size(); ++i) found[after.ijk[i]] = after.density[i];
+      expected[before.ijk[i]] = before.probability[i];
+  for (size_t i = 0; i < after.ijk.size(); ++i) found[after.ijk[i]] = after.probability[i];
   EXPECT_EQ(found, expected);
   EXPECT_LT(found.size(), before.ijk.size());
   const json said = json::parse(ended.out);
@@ -540,6 +543,16 @@ TEST_F(Program, RethresholdDropsWhatIsLessProbable) {
   EXPECT_EQ(gaussians, readPly(at("y/y.ply")).size());
   for (size_t i = 0; i < provenance.generated.size(); ++i)
     EXPECT_TRUE(!provenance.generated[i] || provenance.probability[i] > limit);
+  // The surface is that of the voxels that are left.
+  ASSERT_TRUE(after.seen_distance);
+  const FloatGrid::Ptr surface =
+      closedSurface(after.frame, solidVoxels(after), *after.seen_distance);
+  const VdbFile file = readVdb("test", at("y/y.vdb"), uint64_t(1) << 30);
+  const auto written = findGrid<FloatGrid>("test", file.grids, "surface", "y.vdb");
+  ASSERT_EQ(written->activeVoxelCount(), surface->activeVoxelCount());
+  const auto values = written->getConstAccessor();
+  for (auto value = surface->cbeginValueOn(); value; ++value)
+    ASSERT_EQ(values.getValue(value.getCoord()), *value) << value.getCoord();
   // A new run with that tau keeps the same tokens.
   options.back() = std::to_string(tau);
   ASSERT_EQ(run(complete(at("views"), options)).code, kOk);

@@ -268,10 +268,12 @@ TEST(SceneVdb, ForeignFilesWithNonsenseThrow) {
   rejects([](Grids& g, MetaMap&) {
     for (auto& [name, grid] : g) grid->transform().postScale({1, 2, 1});
   });
-  rejects(
-      [&](Grids& g, MetaMap&) { floats(g, "density").tree().setValueOn(Coord(99, 0, 0), 1.f); });
+  const auto observed = [](Grids& g) -> BoolTree& {
+    return openvdb::gridPtrCast<BoolGrid>(g["observed"])->tree();
+  };
+  rejects([&](Grids& g, MetaMap&) { observed(g).setValueOn(Coord(99, 0, 0), true); });
   // One tile in a few bytes: 4,096^3 voxels.
-  rejects([&](Grids& g, MetaMap&) { floats(g, "density").tree().addTile(2, Coord(0), 1.f, true); });
+  rejects([&](Grids& g, MetaMap&) { observed(g).addTile(2, Coord(0), true, true); });
   const Coord voxel = smallScene().ijk[0];
   rejects([&](Grids& g, MetaMap&) { floats(g, "bfs_level").tree().setValueOn(voxel, -1.f); });
   rejects([&](Grids& g, MetaMap&) { floats(g, "probability").tree().setValueOn(voxel, NAN); });

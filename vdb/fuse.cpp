@@ -21,10 +21,14 @@ constexpr double kFinest = .01, kCoarsest = .05;  // metres
 constexpr int kCell = 4;                          // pixels over whose means slopes are taken
 constexpr double kSameSurface = .03;              // of 1/z: neighbours within are one surface
 constexpr double kLeastCosine = .1;
-constexpr float kDistanceSteps = 48;  // of the band
 constexpr float kShell = .67f;        // of the band: how thick at least what was measured is
 
-// Round distances make small files.
+// Round distances make small files, and those most whose last bits are 0.
+float stepOf(float band) {
+  int exponent = 0;
+  std::frexp(band, &exponent);
+  return std::ldexp(1.f, exponent - 6);  // a 32nd to a 64th of the band
+}
 float roundedTo(float step, float distance) { return std::round(distance / step) * step; }
 
 // --- what a view measured -----------------------------------------------------------------------
@@ -258,7 +262,7 @@ Leaf* fuseLeaf(const VoxelFrame& detail, const Coord& origin, const std::vector<
   }
   if (!any) return nullptr;
   auto* leaf = new Leaf(origin, float(band), false);
-  const float step = float(band) / kDistanceSteps;
+  const float step = stepOf(float(band));
   for (openvdb::Index n = 0; n < Leaf::SIZE; ++n)
     if (voxels[n].any()) leaf->setValueOn(n, roundedTo(step, voxels[n].distance(float(band))));
   if (leaf->isEmpty()) {
@@ -331,7 +335,7 @@ FloatGrid::Ptr fuseDepth(const VoxelFrame& frame, const SeenSpace& seen,
   return gridOf(leaves, detail);
 }
 
-int detailPartsOf(const VoxelFrame& frame, const FloatGrid& fused) {
+int detailPartsOf(const VoxelFrame& frame, const openvdb::GridBase& fused) {
   const double parts = double(frame.voxel_m) / fused.voxelSize()[0];
   const int whole = int(std::lround(parts));
   require(whole >= 1 && whole <= 64 && std::abs(parts - whole) < 1e-3,
@@ -399,7 +403,7 @@ void keepBand(FloatGrid* grid) {
 
 // Only the band stays active; what is beyond has its sign.
 void trimBand(float band, FloatGrid* grid) {
-  const float step = band / kDistanceSteps;
+  const float step = stepOf(band);
   std::vector<Leaf*> leaves;
   grid->tree().getNodes(leaves);
   tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {

@@ -29,7 +29,7 @@ FloatGrid::Ptr fuseDepth(const VoxelFrame& frame, const SeenSpace& seen,
 
 /// How many detail voxels lie along the edge of one of the frame's. Throws Error where `fused` does
 /// not fit the frame.
-int detailPartsOf(const VoxelFrame& frame, const FloatGrid& fused);
+int detailPartsOf(const VoxelFrame& frame, const openvdb::GridBase& fused);
 
 /// One closed level set: the boundary of the solid voxels, smoothed, cut back to what was measured
 /// where the views saw it. In the grid of `fused`, half width kDetailBand.

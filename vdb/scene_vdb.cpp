@@ -58,10 +58,15 @@ bool fromGrid(const openvdb::Vec3f& from, Eigen::Vector3f* to) {
 }
 
 /// Exact signed distance (world units, negative inside) to the boundary of the union of the active
-/// voxels of `solid`, in a band of kBandVoxels at both sides. Squared distances to boxes add up
+/// voxels that are solid, in a band of kBandVoxels at both sides. Squared distances to boxes add up
 /// over the axes, so three one-dimensional minima per leaf do it (Felzenszwalb and Huttenlocher
 /// 2012, sec. 2.1, with the distance to a cell instead of a point).
-FloatGrid::Ptr boundaryLevelSet(const MaskTree& solid, double voxel_m) {
+FloatGrid::Ptr boundaryLevelSet(const SceneVoxels& v) {
+  const auto voxel_m = double(v.frame.voxel_m);
+  MaskTree solid;
+  openvdb::tree::ValueAccessor<MaskTree, false> set(solid);
+  for (const Coord& ijk : solidVoxels(v)) set.setValueOn(ijk);
+
   using Leaf = FloatTree::LeafNodeType;
   constexpr int kReach = kBandVoxels;  // a cell further off is outside the band
   constexpr int kSide = int(Leaf::DIM) + 2 * kReach;
@@ -160,7 +165,58 @@ void requireWritable(const SceneVoxels& v, const std::string& path) {
   }
 }
 
-// What is solid: what stands where views saw nothing is made up and wrong.
+// How many voxels of a grid lie along a voxel of the frame; throws where it is not in the frame.
+int partsOf(const char* operation, const openvdb::GridBase& grid, const VoxelFrame& frame,
+            const std::string& path) {
+  const int parts = detailPartsOf(frame, grid);
+  VoxelFrame detail = frame;
+  detail.voxel_m = frame.voxel_m / float(parts);
+  const openvdb::Mat4d expected = fileTransform(detail)->baseMap()->getAffineMap()->getMat4(),
+                       found = grid.transform().baseMap()->getAffineMap()->getMat4();
+  double off = 0;
+  for (int row = 0; row < 4; ++row)
+    for (int col = 0; col < 4; ++col)
+      off = std::max(off, std::abs(expected[row][col] - found[row][col]));
+  require(off < 1e-6 * std::max(1., frame.world_from_grid.translation().cwiseAbs().maxCoeff()),
+          operation, ": ", path, ": grid '", grid.getName(),
+          "' does not lie in the volume's frame");
+  return parts;
+}
+
+// A distance grid of another program's making may hold anything.
+FloatGrid::ConstPtr checkedDistance(const char* operation, const FloatGrid::Ptr& grid,
+                                    const VoxelFrame& frame, const std::string& path) {
+  const float edge = frame.voxel_m / float(partsOf(operation, *grid, frame, path));
+  const float most = 1.01f * float(kDetailBand) * edge;
+  for (auto value = grid->cbeginValueOn(); value; ++value)
+    require(std::abs(*value) <= most, operation, ": ", path, ": voxel ", value.getCoord(), " of '",
+            kSeenDistance, "' has a value that makes no sense");
+  return grid;
+}
+
+// The value of a voxel of the frame: the grid's own or, in detail voxels, the mean of those there.
+template <typename GridType>
+class VoxelValues {
+ public:
+  VoxelValues(const GridType& grid, int parts)
+      : values_(grid.getConstUnsafeAccessor()), parts_(parts) {}
+  typename GridType::ValueType at(const Coord& ijk) const {
+    if (parts_ == 1) return values_.getValue(ijk);
+    typename GridType::ValueType sum(0);
+    int n = 0;
+    const Coord low(ijk.x() * parts_, ijk.y() * parts_, ijk.z() * parts_);
+    for (const Coord& c : CoordBBox::createCube(low, parts_))
+      if (values_.isValueOn(c)) sum += values_.getValue(c), ++n;
+    return n > 0 ? typename GridType::ValueType(sum / float(n)) : sum;
+  }
+
+ private:
+  typename GridType::ConstUnsafeAccessor values_;
+  int parts_;
+};
+
+}  // namespace
+
 std::vector<Coord> solidVoxels(const SceneVoxels& v) {
   std::vector<Coord> solid;
   const openvdb::tree::ValueAccessor<const TokenMask, false> empty(v.empty);
@@ -169,44 +225,11 @@ std::vector<Coord> solidVoxels(const SceneVoxels& v) {
   return solid;
 }
 
-FloatGrid::Ptr surfaceOf(const SceneVoxels& v) {
-  const std::vector<Coord> solid = solidVoxels(v);
-  if (v.seen_distance) return closedSurface(v.frame, solid, *v.seen_distance);
-  MaskTree mask;
-  openvdb::tree::ValueAccessor<MaskTree, false> cells(mask);
-  for (const Coord& ijk : solid) cells.setValueOn(ijk);
-  return boundaryLevelSet(mask, double(v.frame.voxel_m));
-}
-
-// A distance grid of another program's making may hold anything.
-FloatGrid::ConstPtr checkedDistance(const char* operation, const FloatGrid::Ptr& grid,
-                                    const VoxelFrame& frame, const std::string& path) {
-  const int parts = detailPartsOf(frame, *grid);
-  VoxelFrame detail = frame;
-  detail.voxel_m = frame.voxel_m / float(parts);
-  const openvdb::Mat4d expected = fileTransform(detail)->baseMap()->getAffineMap()->getMat4(),
-                       found = grid->transform().baseMap()->getAffineMap()->getMat4();
-  double off = 0;
-  for (int row = 0; row < 4; ++row)
-    for (int col = 0; col < 4; ++col)
-      off = std::max(off, std::abs(expected[row][col] - found[row][col]));
-  require(off < 1e-6 * std::max(1., frame.world_from_grid.translation().cwiseAbs().maxCoeff()),
-          operation, ": ", path, ": grid '", kSeenDistance, "' does not lie in the volume's frame");
-  const float most = 1.01f * float(kDetailBand) * detail.voxel_m;
-  for (auto value = grid->cbeginValueOn(); value; ++value)
-    require(std::abs(*value) <= most, operation, ": ", path, ": voxel ", value.getCoord(), " of '",
-            kSeenDistance, "' has a value that makes no sense");
-  return grid;
-}
-
-}  // namespace
-
-void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
-  requireWritable(voxels, path);
+void writeSceneVdb(const SceneVoxels& v, const std::string& path, const DetailGrids& detail) {
+  requireWritable(v, path);
   openvdb::initialize();
-
-  const auto& v = voxels;
-  std::vector<std::pair<const char*, openvdb::GridBase::Ptr>> named = {{kSurface, surfaceOf(v)}};
+  std::vector<std::pair<const char*, openvdb::GridBase::Ptr>> named = {
+      {kSurface, detail.surface ? detail.surface : boundaryLevelSet(v)}};
   forEachColumn(
       [&](const auto& c) {
         using Value = typename std::decay_t<decltype(c)>::Value;
@@ -221,12 +244,16 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
         }
       },
       v);
-  if (v.seen_distance) {
-    const FloatGrid::Ptr distance = v.seen_distance->deepCopy();
-    distance->setSaveFloatAsHalf(true), named[0].second->setSaveFloatAsHalf(true);
-    named.emplace_back(kSeenDistance, distance);
-  }
   named[1].second->setGridClass(openvdb::GRID_FOG_VOLUME);  // `density` is the first column
+  std::vector<openvdb::GridBase::Ptr> fine;                 // in detail voxels
+  if (detail.surface) {
+    named[1].second = detail.density, named[2].second = detail.colour;
+    fine = {detail.surface, detail.density, detail.colour};
+  }
+  if (v.seen_distance) {
+    fine.push_back(v.seen_distance->deepCopy());
+    named.emplace_back(kSeenDistance, fine.back());
+  }
   // Where a tool wants to mask by what was made up, it should not have to invert a grid.
   named.insert(
       named.begin() + 4,
@@ -238,8 +265,8 @@ void writeSceneVdb(const SceneVoxels& voxels, const std::string& path) {
     grid->setName(name);
     grid->setCreator("vdb_complete");
     // One object: OpenVDB keeps it by pointer. The detail voxels' grids have their own.
-    const bool is_detail = v.seen_distance && (name == kSurface || name == kSeenDistance);
-    if (!is_detail) grid->setTransform(transform);
+    const bool is_fine = std::find(fine.begin(), fine.end(), grid) != fine.end();
+    if (!is_fine) grid->setTransform(transform);
     grids.push_back(grid);
   }
   const auto observed =
@@ -288,24 +315,20 @@ SceneVoxels readSceneVdb(const std::string& path) {
   constexpr const char* kOperation = "readSceneVdb";
   constexpr uint64_t kMaxBytes = uint64_t(1) << 32;
   const auto [grids, metadata] = readVdb(kOperation, path, kMaxBytes);
-  const auto density = findGrid<FloatGrid>(kOperation, grids, "density", path);
+  const auto observed = findGrid<BoolGrid>(kOperation, grids, "observed", path);
   const auto empty = findGrid<BoolGrid>(kOperation, grids, kSeenEmpty, path);
-  for (const openvdb::GridBase::Ptr& grid : grids)
-    require(grid->getName() == kSurface || grid->getName() == kSeenDistance ||
-                grid->transform() == density->transform(),
-            "readSceneVdb: ", path, ": grid '", grid->getName(),
-            "' has another transform than 'density'");
-
+  require(empty->transform() == observed->transform(), kOperation, ": ", path, ": grid '",
+          kSeenEmpty, "' has another transform than 'observed'");
   SceneVoxels voxels;
-  voxels.frame = readVolume(kOperation, metadata, density->transform(), 0, path);
+  voxels.frame = readVolume(kOperation, metadata, observed->transform(), 0, path);
 
   // A few bytes can claim a tile of 4,096^3 voxels: count before taking memory.
   constexpr uint64_t kMaxVoxels = uint64_t(1) << 27;
-  const uint64_t count = density->activeVoxelCount();
+  const uint64_t count = observed->activeVoxelCount();
   require(count <= kMaxVoxels, "readSceneVdb: ", path, ": expected at most ", kMaxVoxels,
           " voxels, found ", count);
   voxels.ijk.reserve(count);
-  for (auto value = density->cbeginValueOn(); value; ++value) {
+  for (auto value = observed->cbeginValueOn(); value; ++value) {
     CoordBBox box;
     value.getBoundingBox(box);
     require(voxels.frame.bounds.isInside(box), "readSceneVdb: ", path, ": voxels ", box,
@@ -317,10 +340,11 @@ SceneVoxels readSceneVdb(const std::string& path) {
         using Value = typename std::decay_t<decltype(c)>::Value;
         if constexpr (!std::is_same_v<Value, Coord>) {
           const auto grid = findGrid<typename GridOf<Value>::Grid>(kOperation, grids, c.name, path);
-          const auto value = grid->getConstUnsafeAccessor();
+          const VoxelValues<typename GridOf<Value>::Grid> value(
+              *grid, partsOf(kOperation, *grid, voxels.frame, path));
           c.values.resize(voxels.ijk.size());
           for (size_t i = 0; i < voxels.ijk.size(); ++i)
-            require(fromGrid(value.getValue(voxels.ijk[i]), &c.values[i]), kOperation, ": ", path,
+            require(fromGrid(value.at(voxels.ijk[i]), &c.values[i]), kOperation, ": ", path,
                     ": voxel ", voxels.ijk[i], " of '", c.name,
                     "' has a value that makes no sense");
         }

@@ -32,16 +32,26 @@ struct SceneVoxels {
   }
 };
 
+/// What a finished scene is in detail voxels (splat/detail_grids.h); all there, or none.
+struct DetailGrids {
+  FloatGrid::Ptr surface, density;
+  Vec3SGrid::Ptr colour;
+};
+
+/// The voxels that `surface` goes round: generated ones that stand where views saw nothing are made
+/// up and wrong.
+std::vector<Coord> solidVoxels(const SceneVoxels& voxels);
+
 /// Writes standard 5-4-3 grids: surface (level set), density (fog), Cd (vec3s), observed, generated
 /// (bool), probability, bfs_level (float), seen_empty (bool); world transform with the grid's
 /// rotation; metadata as docs/formats.md says. Voxel ijk's centre is at ijk + 0.5 in frame units:
 /// the file's transform has the half-voxel shift so that grid index space is cell-centred.
-/// `surface`: with `seen_distance`, which is written too, closedSurface() in its detail voxels;
-/// else the exact distance to the boundary of the voxels. Generated ones that lie in
-/// `empty` are left out of it. A checksum follows what OpenVDB reads. Written to a temporary name
-/// and renamed. Throws Error for voxels outside the bounds, twice the same, or with values that are
-/// not finite, and where the file cannot be written.
-void writeSceneVdb(const SceneVoxels& voxels, const std::string& path);
+/// `surface` is the exact distance to the boundary of solidVoxels(); it, `density` and `Cd` are
+/// those of `detail` where given. A checksum follows what OpenVDB reads. Written to a temporary
+/// name and renamed. Throws Error for voxels outside the bounds, twice the same, or with values
+/// that are not finite, and where the file cannot be written.
+void writeSceneVdb(const SceneVoxels& voxels, const std::string& path,
+                   const DetailGrids& detail = {});
 
 /// Several completions of one place, each as its voxels: float grids `occupancy_mean` and
 /// `occupancy_variance` (the share of them that fill a voxel, m, and m (1 - m)), cell-centred as
@@ -50,7 +60,8 @@ void writeOccupancyVdb(const VoxelFrame& frame, const std::vector<std::vector<Co
                        const std::string& path);
 
 /// Reads back what writeSceneVdb wrote (all but `surface`, which is derived), voxels in the order
-/// of the file's tree. Also when another program wrote the file again. Throws Error on files that
+/// of the file's tree; density and colour in detail voxels as their mean over each voxel (none: 1,
+/// black). Also when another program wrote the file again. Throws Error on files that
 /// are missing, corrupt, lack the grids or say what cannot be.
 SceneVoxels readSceneVdb(const std::string& path);
 

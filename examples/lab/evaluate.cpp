@@ -9,6 +9,7 @@
 
 #include "encoder/views/read_views.h"
 #include "examples/lab/feature_distances.h"
+#include "examples/lab/judge.h"
 #include "examples/lab/scenes.h"
 #include "examples/lab/scores.h"
 #include "examples/rooms/rooms.h"
@@ -18,6 +19,7 @@
 #include "splat/rasterize.h"
 #include "vdb/process.h"
 #include "vdb/progress.h"
+#include "vdb/token_map.h"
 
 namespace vdbc {
 namespace {
@@ -159,21 +161,90 @@ MethodOutput manhattanBox(const MethodOutput& observed, const SceneVoxels& seen,
   return out;
 }
 
+Eigen::Vector3f meanPixel(const std::vector<View>& views) {
+  Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+  double count = 0;
+  for (const View& v : views)
+    for (size_t i = 0; i + 2 < v.colour.data.size(); i += 3, ++count)
+      sum += Eigen::Map<const Eigen::Vector3f>(&v.colour.data[i]).cast<double>();
+  return (sum / std::max(1., count)).cast<float>();
+}
+
+std::vector<DepthView> allDepths(const EvaluationScene& scene) {
+  std::vector<DepthView> depths;
+  for (const std::vector<View>* views : {&scene.input, &scene.targets})
+    for (const View& v : *views) depths.push_back(v.depthView());
+  return depths;
+}
+
+// What all methods are held to in a scene.
+struct Truths {
+  const SeenSpace& seen;   // of the input views, voxels
+  SeenSpace all;           // of these and the targets
+  Eigen::Vector3f ground;  // the input pictures' mean colour, display sRGB
+  // [H * W] of each target: pixels whose surface the input saw, and those with another surface.
+  std::vector<std::vector<uint8_t>> seen_pixels, unseen_pixels;
+
+  Truths(const EvaluationScene& scene, const VoxelFrame& frame, const SeenSpace& input,
+         const CarveSettings& carving, Progress& progress)
+      : seen(input),
+        all(carve(frame, allDepths(scene), carving, progress)),
+        ground(meanPixel(scene.input)) {
+    StateLookup states(input);
+    for (const View& v : scene.targets) {
+      const int w = v.camera.width;
+      std::vector<uint8_t> in(v.depth.size(), 0), out = in;
+      for (size_t i = 0; i < v.depth.size(); ++i) {
+        if (!(v.depth[i] > 0) || !std::isfinite(v.depth[i])) continue;
+        const Eigen::Vector3d p = frame.toIndex(v.camera.unproject(
+            double(int(i) % w) + .5, double(int(i) / w) + .5, double(v.depth[i])));
+        const Coord ijk(int(std::floor(p.x())), int(std::floor(p.y())), int(std::floor(p.z())));
+        (states(ijk) == NodeState::kFilled ? in : out)[i] = 1;
+      }
+      seen_pixels.push_back(std::move(in)), unseen_pixels.push_back(std::move(out));
+    }
+  }
+};
+
+Image overColour(const RasterOutput& out, const Eigen::Vector3f& ground) {
+  Image image = out.colour;
+  for (size_t i = 0; i < image.data.size(); ++i)
+    image.data[i] =
+        std::clamp(image.data[i] + (1 - out.alpha.data[i / 3]) * ground[int(i % 3)], 0.f, 1.f);
+  return image;
+}
+
 // What the target views' cameras see of the Gaussians, against what is there; keeps the first
 // pictures in `shown`.
-void measurePictures(const EvaluationScene& scene, const Gaussians& gaussians, const UserNets& nets,
-                     MethodResult* r, std::vector<Image>* shown) {
+void measurePictures(const EvaluationScene& scene, const Truths& truths, const Gaussians& gaussians,
+                     const UserNets& nets, MethodResult* r, std::vector<Image>* shown) {
   const double share = 1 / double(scene.targets.size());
   RasterSettings settings;
   settings.antialias = gaussians.antialias, settings.median_depth = true;
-  std::vector<double> medians, rmses;
+  std::vector<double> medians, rmses, seen, unseen, unseen_ssims, unseen_flips;
+  PixelVerdict pixels;
   if (!nets.lpips) r->lpips = kNan;
-  for (const View& target : scene.targets) {
+  for (size_t t = 0; t < scene.targets.size(); ++t) {
+    const View& target = scene.targets[t];
     RasterOutput out = rasterize(gaussians, target.camera, settings);
+    const Image filled = overColour(out, truths.ground);
     for (float& v : out.colour.data) v = std::clamp(v, 0.f, 1.f);
     r->psnr += share * psnr(out.colour, target.colour);
     r->ssim += share * ssim(out.colour, target.colour);
     r->flip += share * flip(target.colour, out.colour);
+    r->mean_psnr += share * psnr(filled, target.colour);
+    r->mean_ssim += share * ssim(filled, target.colour);
+    r->mean_flip += share * flip(target.colour, filled);
+    const PictureError in = pictureError(target.colour, filled, truths.seen_pixels[t]),
+                       out_of = pictureError(target.colour, filled, truths.unseen_pixels[t]);
+    if (in.pixels > 0) seen.push_back(in.psnr);
+    if (out_of.pixels > 0) {
+      unseen.push_back(out_of.psnr), unseen_ssims.push_back(out_of.ssim);
+      unseen_flips.push_back(out_of.flip);
+    }
+    const PixelVerdict verdict = judgePixels(out.median_depth.data, target.depth);
+    r->blocked += share * verdict.blocked, r->right += share * verdict.right;
+    r->behind += share * verdict.behind, r->open += share * verdict.open;
     if (nets.lpips) r->lpips += share * nets.lpips->distance(target.colour, out.colour);
     if (nets.features) {
       r->features.push_back(nets.features->features(out.colour));
@@ -186,6 +257,37 @@ void measurePictures(const EvaluationScene& scene, const Gaussians& gaussians, c
     medians.push_back(depth.median_abs_m), rmses.push_back(depth.rmse_m);
   }
   r->depth_median_m = meanOf(medians), r->depth_rmse_m = meanOf(rmses);
+  r->seen_psnr = meanOf(seen), r->unseen_psnr = meanOf(unseen);
+  r->unseen_ssim = meanOf(unseen_ssims), r->unseen_flip = meanOf(unseen_flips);
+}
+
+void measureVoxels(const Truths& truths, const std::vector<Coord>& voxels, MethodResult* r) {
+  const VoxelVerdict v = judgeVoxels(truths.seen, truths.all, voxels);
+  r->confirmed = double(v.confirmed), r->contradicted = double(v.contradicted);
+  r->undecided = double(v.undecided);
+  r->voxel_precision = v.exact.precision, r->voxel_recall = v.exact.recall;
+  r->voxel_f1 = v.exact.f1;
+  r->near_precision = v.near.precision, r->near_recall = v.near.recall, r->near_f1 = v.near.f1;
+}
+
+// What input and target views say together, in the frame.
+Place densePlace(const EvaluationScene& scene, const Encoder& encoder, ObserveSettings observing,
+                 const VoxelFrame& frame, Progress& progress) {
+  std::vector<View> views = scene.input;
+  views.insert(views.end(), scene.targets.begin(), scene.targets.end());
+  observing.frame = frame;
+  return encoder.encode(views, observe(views, encoder.observing(observing), progress), progress);
+}
+
+// The latents that `from` has for tokens of `place`, in their place.
+Place withLatentsOf(Place place, const Place& from) {
+  TokenMap<size_t> rows;
+  for (size_t i = 0; i < from.ijk.size(); ++i) rows.insert(from.ijk[i], i);
+  const auto dim = size_t(place.dim);
+  for (size_t i = 0; i < place.ijk.size(); ++i)
+    if (const size_t* row = place.generated[i] ? rows.find(place.ijk[i]) : nullptr)
+      std::copy_n(&from.z[*row * dim], dim, &place.z[i * dim]);
+  return place;
 }
 
 // The nodes of level 1 that count: of a scene with truth, those that were unobserved.
@@ -357,6 +459,13 @@ const std::vector<Score<MethodResult>> kScores = {
     {"psnr", &MethodResult::psnr},
     {"ssim", &MethodResult::ssim},
     {"flip", &MethodResult::flip},
+    {"mean_psnr", &MethodResult::mean_psnr},
+    {"mean_ssim", &MethodResult::mean_ssim},
+    {"mean_flip", &MethodResult::mean_flip},
+    {"seen_psnr", &MethodResult::seen_psnr},
+    {"unseen_psnr", &MethodResult::unseen_psnr},
+    {"unseen_ssim", &MethodResult::unseen_ssim},
+    {"unseen_flip", &MethodResult::unseen_flip},
     {"lpips", &MethodResult::lpips},
     {"fid", &MethodResult::fid},
     {"kid", &MethodResult::kid},
@@ -372,6 +481,19 @@ const std::vector<Score<MethodResult>> kScores = {
     {"outside", &MethodResult::outside},
     {"ece", &MethodResult::ece},
     {"leak", &MethodResult::leak},
+    {"confirmed", &MethodResult::confirmed},
+    {"contradicted", &MethodResult::contradicted},
+    {"undecided", &MethodResult::undecided},
+    {"voxel_precision", &MethodResult::voxel_precision},
+    {"voxel_recall", &MethodResult::voxel_recall},
+    {"voxel_f1", &MethodResult::voxel_f1},
+    {"near_precision", &MethodResult::near_precision},
+    {"near_recall", &MethodResult::near_recall},
+    {"near_f1", &MethodResult::near_f1},
+    {"blocked", &MethodResult::blocked},
+    {"right", &MethodResult::right},
+    {"behind", &MethodResult::behind},
+    {"open", &MethodResult::open},
     {"seconds", &MethodResult::seconds},
     {"peak_rss_mb", &MethodResult::peak_rss_mb}};
 }  // namespace
@@ -407,6 +529,7 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   const VoxelFrame& frame = place.frame;
   const SeenSpace states = poolSeen(*place.seen, 1);
   const UnseenNodes unseen(scene, frame, states);
+  const Truths truths(scene, frame, *place.seen, s.observing.carving, progress);
 
   std::vector<MethodResult> results;
   std::vector<std::vector<Image>> columns(1);
@@ -417,7 +540,8 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
     r.scene = scene.name, r.method = method, r.views = int(scene.input.size());
     r.gaussians = output.gaussians.size();
     columns.emplace_back();
-    measurePictures(scene, output.gaussians, nets, &r, &columns.back());
+    measurePictures(scene, truths, output.gaussians, nets, &r, &columns.back());
+    measureVoxels(truths, output.voxels, &r);
     measureNodes(scene, frame, unseen, output.voxels, &r);
     r.seconds = seconds, r.peak_rss_mb = peakMemoryMb();
     results.push_back(r);
@@ -459,11 +583,16 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   if (scene.truth) {
     results.back().reliability = reliabilityOf(place, unseen.truth);
     results.back().ece = calibrationError(*results.back().reliability);
-    start = std::chrono::steady_clock::now();
-    const Place oracle = completer.completeAt(seen_place, surfaceNodes(*scene.truth, frame, 1),
-                                              s.completion, progress);
-    add("oracle-occupancy", look(oracle), observed_seconds + secondsSince(start));
   }
+  start = std::chrono::steady_clock::now();
+  const std::vector<Coord> occupied =
+      scene.truth ? surfaceNodes(*scene.truth, frame, 1) : filledNodes(poolSeen(truths.all, 1));
+  const Place oracle = completer.completeAt(seen_place, occupied, s.completion, progress);
+  add("oracle-occupancy", look(oracle), observed_seconds + secondsSince(start));
+  start = std::chrono::steady_clock::now();
+  const Place told =
+      withLatentsOf(oracle, densePlace(scene, encoder, s.observing, frame, progress));
+  add("oracle-latents", look(told), observed_seconds + secondsSince(start));
   if (!picture.empty()) writeColumns(columns, picture);
   for (double tau : taus) {
     s.completion.tau = float(tau);

@@ -94,8 +94,12 @@ struct UserNets {
 struct MethodResult {
   std::string scene, method;
   int views = 0;
-  double psnr = 0, ssim = 0, flip = 0;  // mean over target views
-  double lpips = 0;                     // the same, by the user's network; NaN without one
+  double psnr = 0, ssim = 0, flip = 0;  // mean over target views, over black
+  // The same over the mean colour of the input pictures, which emptiness and fog have too; then of
+  // the pixels alone whose surface an input view saw, and of those that none did.
+  double mean_psnr = 0, mean_ssim = 0, mean_flip = 0;
+  double seen_psnr = 0, unseen_psnr = 0, unseen_ssim = 0, unseen_flip = 0;
+  double lpips = 0;  // the same, by the user's network; NaN without one
   // Median depth against the targets' depth, where both are: mean over target views of the median
   // of the absolute difference and of the root mean square, metres.
   double depth_median_m = 0, depth_rmse_m = 0;
@@ -113,6 +117,11 @@ struct MethodResult {
   double ece = std::numeric_limits<double>::quiet_NaN();  // calibrationError(); of `completed` only
   std::optional<Reliability> reliability;  // the same; of a mean the sums over its scenes
   double leak = 0;  // share of rays from free space that pass the true surface
+  // Against all views, input and targets (judge.h): generated voxels, and the targets' pixels.
+  double confirmed = 0, contradicted = 0, undecided = 0;
+  double voxel_precision = 0, voxel_recall = 0, voxel_f1 = 0;
+  double near_precision = 0, near_recall = 0, near_f1 = 0;
+  double blocked = 0, right = 0, behind = 0, open = 0;
   double seconds = 0, peak_rss_mb = 0;
   int64_t gaussians = 0;
 };
@@ -121,8 +130,10 @@ std::string resultJson(const MethodResult& result);
 /// One JSON object: scene, views, method and, a bin, [count, sum of probabilities, hits].
 std::string reliabilityJson(const MethodResult& result);
 
-/// Methods: observed, pixel-aligned, nearest, box, completed, oracle-occupancy (rooms only), and
-/// completed-tau-T for each T of `taus`. With a `picture` writes a PNG: of at most four target
+/// Methods: observed, pixel-aligned, nearest, box, completed, oracle-occupancy (the completer's
+/// latents in the nodes that the room's surfaces pass or, of a folder, that any view saw filled),
+/// oracle-latents (the same, and where all views have a latent theirs), and completed-tau-T for
+/// each T of `taus`. With a `picture` writes a PNG: of at most four target
 /// views the truth, then a column a method but pixel-aligned, which looks like observed.
 std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Encoder& encoder,
                                         const Completer& completer, const SceneSettings& settings,

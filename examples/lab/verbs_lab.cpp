@@ -166,7 +166,8 @@ Verb evalVerb() {
              childTauOption(&o->settings.child_threshold),
              option("--pictures FOLDER", &o->pictures,
                     "for N.png of scene N; columns: truth, observed, nearest, box, completed, "
-                    "oracle occupancy (--reconstruct: truth, reconstruction, baselines)")}},
+                    "oracle occupancy, oracle latents (--reconstruct: truth, reconstruction, "
+                    "baselines)")}},
            {"What was seen", detailOptions(&o->settings.detail)},
            completion,
            {"The encoder-decoder alone",
