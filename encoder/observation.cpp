@@ -150,6 +150,33 @@ void meanPatchPoints(const std::vector<View>& views,
   }
 }
 
+// Voxels that lie within `radius_m` of a camera as a whole become seen empty, unless they are
+// filled.
+void openLenses(const std::vector<View>& views, const VoxelFrame& frame, float radius_m,
+                SeenSpace* seen) {
+  const double radius = double(radius_m) / double(frame.voxel_m);
+  for (const View& v : views) {
+    const Eigen::Vector3d lens = frame.toIndex(v.camera.world_from_camera.translation());
+    CoordBBox ball;
+    for (int axis = 0; axis < 3; ++axis) {
+      // A camera far outside of the volume must not leave the range of coordinates.
+      const auto inside = [&](double c) {
+        return int(
+            std::clamp(c, double(seen->box.min()[axis]) - 1, double(seen->box.max()[axis]) + 1));
+      };
+      ball.min()[axis] = inside(std::floor(lens[axis] - radius));
+      ball.max()[axis] = inside(std::floor(lens[axis] + radius));
+    }
+    ball.intersect(seen->box);
+    for (const Coord& ijk : ball) {
+      const Eigen::Vector3d middle(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5);
+      const Eigen::Vector3d corner = (middle - lens).cwiseAbs().array() + .5;
+      if (corner.norm() <= radius && !seen->filled.isValueOn(ijk)) seen->empty.setValueOn(ijk);
+    }
+  }
+  seen->empty.prune();
+}
+
 }  // namespace
 
 Observation observe(const std::vector<View>& views, const ObserveSettings& settings,
@@ -164,7 +191,9 @@ Observation observe(const std::vector<View>& views, const ObserveSettings& setti
   constexpr CarveSettings kAsItIs{std::numeric_limits<float>::infinity(), 0};
   Observation o;
   o.frame = settings.frame ? *settings.frame : fitVolume(usable, settings.volume, kAsItIs);
-  o.seen = std::make_shared<const SeenSpace>(carve(o.frame, usable, kAsItIs, progress));
+  const auto seen = std::make_shared<SeenSpace>(carve(o.frame, usable, kAsItIs, progress));
+  openLenses(views, o.frame, settings.lens_m, seen.get());
+  o.seen = seen;
   o.tokens = TokenGrid(o.seen->filled);
   require(o.tokens.size(0) > 0,
           "observe: the views: no valid depth falls into the volume (expected at least one pixel)");

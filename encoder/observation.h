@@ -49,11 +49,13 @@ struct ObserveSettings {
   VolumeSettings volume;            // of the grid that is fitted to the views
   std::optional<VoxelFrame> frame;  // the grid, where it is given
   CarveSettings carving;
+  float lens_m = .3f;       // round every camera nothing is there: somebody stood in that place
   int patches_across = 14;  // patches along the image's width; rows follow the aspect ratio
   int level = 1;            // tree level of the latents, whose tokens' pixels are counted
 };
 
-/// Fits the volume (or takes the given frame), carves it and pools pixels into voxels and patches.
+/// Fits the volume (or takes the given frame), carves it, opens the space round the cameras where
+/// no pixel's point lies, and pools pixels into voxels and patches.
 /// Throws Error if no pixel of any view falls into the frame's bounds, and as fitVolume() does.
 Observation observe(const std::vector<View>& views, const ObserveSettings& settings,
                     Progress& progress);

@@ -236,6 +236,42 @@ TEST(Observation, PixelsWithoutDepthSayNothing) {
     EXPECT_EQ(o.patch_points[size_t(p) * 4 + 3] > 0, p % 4 < 2) << p;
 }
 
+TEST(Observation, NothingIsWhereACameraStood) {
+  std::vector<View> views = roomViews();
+  // What the first camera sees of its own place is nothing: pixels before it alone are known.
+  const VoxelFrame frame = fittedFrame(views, .05f);
+  // One pixel's point lies within reach of the second lens: it stays.
+  View& near = views[1];
+  near.depth[size_t(near.camera.width * near.camera.height / 2 + near.camera.width / 2)] = .15f;
+  ObserveSettings settings;
+  settings.frame = frame;
+  settings.carving.flying_pixel_ratio = 0;
+  Progress silent;
+  const Observation open = observe(views, settings, silent);
+  settings.lens_m = 0;
+  const Observation carved = observe(views, settings, silent);
+  int opened = 0;
+  for (const Coord& ijk : frame.bounds) {
+    double farthest = 1e9;  // corner of the voxel from the nearest lens, metres
+    for (const View& v : views) {
+      double corner = 0;
+      for (int k = 0; k < 8; ++k) {
+        const Eigen::Vector3d p = frame.toWorld(
+            Eigen::Vector3d(ijk.x() + (k & 1), ijk.y() + (k >> 1 & 1), ijk.z() + (k >> 2)));
+        corner = std::max(corner, (p - v.camera.world_from_camera.translation()).norm());
+      }
+      farthest = std::min(farthest, corner);
+    }
+    NodeState expected = carved.seen->at(ijk);
+    if (expected == NodeState::kUnobserved && farthest <= .3)
+      expected = NodeState::kEmpty, ++opened;
+    if (std::abs(farthest - .3) < 1e-6) continue;
+    ASSERT_EQ(open.seen->at(ijk), expected) << ijk;
+  }
+  EXPECT_GT(opened, 50);
+  EXPECT_EQ(open.tokens.coords(0), carved.tokens.coords(0));
+}
+
 TEST(Observation, NothingInTheBoundsThrows) {
   VoxelFrame frame;
   frame.bounds = CoordBBox(Coord(500), Coord(540));
