@@ -28,9 +28,10 @@ const char* typeName(torch::ScalarType type) {
 
 torch::ScalarType typeOf(const std::string& name, const std::string& path) {
   if (name == "F32") return torch::kFloat32;
+  if (name == "F16") return torch::kFloat16;
   if (name == "I32") return torch::kInt32;
   if (name == "I64") return torch::kInt64;
-  throw Error(joinText("readTensors: ", path, ": expected dtype F32, I32 or I64, found ", name));
+  throw Error(joinText("readTensors: ", path, ": expected dtype F16, F32, I32 or I64, found ", name));
 }
 
 }  // namespace
@@ -104,7 +105,7 @@ TensorFile readTensors(const std::string& path) {
       in.seekg(std::streamoff(8 + length + offsets[0]));
       in.read(static_cast<char*>(t.data_ptr()), std::streamsize(bytes));
       require(in.good(), "readTensors: ", path, ": ", name, " cannot be read");
-      file.tensors[name] = t;
+      file.tensors[name] = type == torch::kFloat16 ? t.to(torch::kFloat32) : t;
     }
   } catch (const json::exception&) {
     throw Error(joinText("readTensors: ", path, ": the header is not valid safetensors JSON"));

@@ -14,7 +14,8 @@ struct TensorFile {
 
 /// Temporary name, then rename. Throws Error where the file cannot be written.
 void writeTensors(const TensorFile& file, const std::string& path);
-/// Throws Error on anything that is not a complete, consistent safetensors file.
+/// Half floats come as float32. Throws Error on anything that is not a complete, consistent
+/// safetensors file.
 TensorFile readTensors(const std::string& path);
 
 /// Parameters and buffers of a module, names prefixed.

@@ -96,12 +96,12 @@ std::string weightsFolder(const std::string& given) {
   std::error_code error;
   const fs::path self = fs::read_symlink("/proc/self/exe", error);
   const std::string beside = error ? "." : self.parent_path().string();
-  for (const char* place : {"/../../weights/small", "/../share/vdb_complete/weights/small"}) {
+  for (const char* place : {"/../../weights/indoor", "/../share/vdb_complete/weights/indoor"}) {
     const std::string folder = beside + place;
     if (fs::exists(folder + "/encoder.safetensors")) return fs::weakly_canonical(folder).string();
   }
   throw Error(
-      "--weights: no trained weights beside the program (expected weights/small; use --weights "
+      "--weights: no trained weights beside the program (expected weights/indoor; use --weights "
       "FOLDER)");
 }
 

@@ -19,7 +19,7 @@
 namespace vdbc {
 namespace {
 
-const std::string kWeights = VDBC_SOURCE_DIR "/weights/small";
+const std::string kWeights = VDBC_SOURCE_DIR "/weights/indoor";
 
 CompleterNet& network() {
   static const std::shared_ptr<CompleterNet> net = [] {

@@ -119,14 +119,14 @@ void expectFileOrDefault(const Config& config, const std::string& text) {
 }
 
 TEST(ShippedWeights, AreWhatTheyWere) {
-  const std::string folder = VDBC_SOURCE_DIR "/weights/small";
+  const std::string folder = VDBC_SOURCE_DIR "/weights/indoor";
   const std::string encoder_path = folder + "/encoder.safetensors",
                     completer_path = folder + "/completer.safetensors";
   const Encoder encoder(encoder_path);
   EXPECT_EQ(encoder.hash(), "f7fa8a83edff251c");
   expectFileOrDefault(encoder.config(), metadataOf(encoder_path)["encoder"]);
   const Completer completer(completer_path);
-  EXPECT_EQ(completer.hash(), "413d0fd949dd241c");
+  EXPECT_EQ(completer.hash(), "74ff05c1bcdf43e7");
   expectFileOrDefault(completer.config(), metadataOf(completer_path)["completer"]);
 }
 

@@ -872,6 +872,15 @@ TEST_F(TensorFiles, RoundTripIsExact) {
   EXPECT_FALSE(fs::exists(path("file.tmp")));
 }
 
+TEST_F(TensorFiles, HalfFloatsComeAsFloats) {
+  // 1, -2 and the least one above 0, by IEEE 754.
+  writeHeader(R"({"a":{"dtype":"F16","shape":[3],"data_offsets":[0,6]}})",
+              std::string("\x00\x3c\x00\xc0\x01\x00", 6));
+  const torch::Tensor a = readTensors(path("bad")).tensors.at("a");
+  ASSERT_EQ(a.scalar_type(), torch::kFloat32);
+  EXPECT_TRUE(torch::equal(a, torch::tensor({1.f, -2.f, std::ldexp(1.f, -24)})));
+}
+
 TEST_F(TensorFiles, EveryTruncationThrows) {
   writeTensors(sample(), path("file"));
   const std::string bytes = bytesOf(path("file"));
@@ -901,7 +910,7 @@ TEST_F(TensorFiles, HostileHeadersThrow) {
   for (
       const char* header :
       {"", "{", "[1]", "3", "null-", R"({"a":3})", R"({"a":{"dtype":"F32"}})",
-       R"({"__metadata__":{"a":3}})", R"({"a":{"dtype":"F16","shape":[1],"data_offsets":[0,2]}})",
+       R"({"__metadata__":{"a":3}})", R"({"a":{"dtype":"F64","shape":[1],"data_offsets":[0,8]}})",
        R"({"a":{"dtype":"F32","shape":[-1],"data_offsets":[0,4]}})",
        R"({"a":{"dtype":"F32","shape":[1],"data_offsets":[4,0]}})",
        R"({"a":{"dtype":"F32","shape":[1],"data_offsets":[0,4,8]}})",

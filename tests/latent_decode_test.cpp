@@ -14,7 +14,7 @@
 namespace vdbc {
 namespace {
 
-constexpr const char* kWeights = VDBC_SOURCE_DIR "/weights/small/encoder.safetensors";
+constexpr const char* kWeights = VDBC_SOURCE_DIR "/weights/indoor/encoder.safetensors";
 
 template <typename T>
 bool sameBytes(const std::vector<T>& a, const std::vector<T>& b) {

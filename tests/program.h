@@ -35,7 +35,7 @@
 #include "vdb/scene_vdb.h"
 
 #ifndef VDBC_WEIGHTS
-#define VDBC_WEIGHTS VDBC_SOURCE_DIR "/weights/small"
+#define VDBC_WEIGHTS VDBC_SOURCE_DIR "/weights/indoor"
 #endif
 
 extern char** environ;

@@ -16,7 +16,7 @@
 namespace vdbc {
 namespace {
 
-constexpr const char* kWeights = VDBC_SOURCE_DIR "/weights/small";
+constexpr const char* kWeights = VDBC_SOURCE_DIR "/weights/indoor";
 
 struct Made {
   SceneVoxels voxels;

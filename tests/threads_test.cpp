@@ -84,7 +84,7 @@ class MainJob : public testing::Test {
   };
 
   static std::string weights(const std::string& name) {
-    return VDBC_SOURCE_DIR "/weights/small/" + name + ".safetensors";
+    return VDBC_SOURCE_DIR "/weights/indoor/" + name + ".safetensors";
   }
   Result run(int threads) const {
     SceneSettings settings;

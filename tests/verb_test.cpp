@@ -317,7 +317,7 @@ TEST(Identity, HasEveryOptionButThoseThatChangeNoGrowth) {
 }
 
 TEST(Identity, EveryOptionChangesIt) {
-  const std::string weights = VDBC_SOURCE_DIR "/weights/small/completer.safetensors";
+  const std::string weights = VDBC_SOURCE_DIR "/weights/indoor/completer.safetensors";
   if (!std::filesystem::exists(weights)) GTEST_SKIP() << "no trained weights";
   const Completer completer(weights);
   const Place start;
@@ -335,7 +335,7 @@ TEST(Identity, EveryOptionChangesIt) {
 }
 
 TEST(Identity, SaysWhereInTheWorldThePlaceIs) {  // tokens count from the volume's own corner
-  const std::string weights = VDBC_SOURCE_DIR "/weights/small/completer.safetensors";
+  const std::string weights = VDBC_SOURCE_DIR "/weights/indoor/completer.safetensors";
   if (!std::filesystem::exists(weights)) GTEST_SKIP() << "no trained weights";
   const Completer completer(weights);
   Place here, there;

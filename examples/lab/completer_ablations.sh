@@ -9,7 +9,7 @@
 scratch "${1:-$root/out/completer_ablations}"
 steps=${2:-500}
 rooms=${ROOMS:-65-80}
-weights=$root/weights/small
+weights=$root/weights/indoor
 mkdir -p "$folder/runs/shipped" "$folder/judged" "$folder/samples"
 encoder_hash=$("$program" info --json | sed 's/.*"encoder":{[^}]*"hash":"\([^"]*\).*/\1/')
 
