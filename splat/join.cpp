@@ -7,7 +7,10 @@
 #include <cmath>
 #include <numeric>
 #include <random>
+#include <unordered_set>
 
+#include "splat/cells.h"
+#include "splat/merge.h"
 #include "splat/rasterize.h"
 #include "vdb/error.h"
 
@@ -21,80 +24,37 @@ using Eigen::Vector3f;
 constexpr int kMostPlanes = 16, kPlaneDraws = 48;
 constexpr float kPlaneSlack = .03f;       // metres; discs within are of a plane
 constexpr float kPlaneCosine = .9f;       // of their normals
+constexpr float kPlaceCell = .5f;         // metres
 constexpr float kLeastPlane = .1f;        // m^2 of discs
-constexpr float kPlaneSigma = .75f;       // of a disc that continues a plane, voxels
+constexpr float kPlaneSigma = .8f;        // of a disc that continues a plane, voxels
 constexpr float kPlaneThickness = .003f;  // metres
-constexpr float kBehind = .03f;   // metres; what continues a plane lies behind what was seen of it
-constexpr float kSideSigmas = 3;  // how far to the sides a Gaussian is looked at
-constexpr float kLeastShrink = .3f;  // smaller ones are dropped
-constexpr float kMostOpacity = .99f;
-constexpr float kWiden = 1.4f, kLeastOpacity = .9f;  // of a voxel's Gaussian
-constexpr int kNearDiscs = 8;
+constexpr float kBehind = .01f;  // metres; what continues a plane lies behind what was seen of it
 
-float opacityOf(float logit) { return 1 / (1 + std::exp(-logit)); }
-float logitOf(float opacity) {
-  const float o = std::clamp(opacity, 1e-4f, kMostOpacity);
-  return std::log(o / (1 - o));
-}
+constexpr int kSideDirections = 4;  // to both sides each, in which a Gaussian is looked at
+constexpr int kMostCuts = 8, kMostPushes = 2;
+constexpr float kCut = .7f;              // what a cut leaves of a Gaussian's width
+constexpr float kFarSide = 2;            // sigmas to the other side, which stays where it is
+constexpr float kPush = .03f;            // metres
+constexpr float kLeastVariance = 1e-8f;  // m^2
+
+constexpr float kMostAcross = .5f;  // of the variance within a sheet, that across it
+
+constexpr float kTouching = 1.8f;  // voxels between centres of neighbours: also across corners
+constexpr float kRim = 3;          // voxels; discs within meet what was generated
+constexpr float kRimSigma = 1;     // voxels; nearer ones count more
+constexpr float kRimPull = 10;     // of a colour where both meet, against that of a neighbour
+constexpr float kLeak = .05f;  // of a difference in colour on its way from voxel to voxel: a metre
+constexpr int kRounds = 60;
+
+constexpr float kWiden = 1.5f, kLeastOpacity = .95f;  // of a voxel's Gaussian
+constexpr float kTileSigmas = 2.6f;                   // by which tiles are widened to close up
 
 Matrix3f axesOf(const Eigen::Vector4f& q) {
   return Eigen::Quaternionf(q[0], q[1], q[2], q[3]).normalized().toRotationMatrix();
 }
-Matrix3f covarianceOf(const Gaussians& g, size_t i) {
-  const Matrix3f axes = axesOf(g.rotation[i]) * g.log_scale[i].array().exp().matrix().asDiagonal();
-  return axes * axes.transpose();
-}
 
-// A Gaussian in the terms that merging takes.
-struct Blob {
-  Vector3f mean = Vector3f::Zero(), colour = Vector3f::Zero();  // colour: SH of degree 0
-  Matrix3f covariance = Matrix3f::Zero();
-  float opacity = 0, probability = 1;
-  bool generated = true;
-};
-
-void appendBlob(const Blob& b, SplatScene* to) {
-  const Eigen::SelfAdjointEigenSolver<Matrix3f> solver(b.covariance);
-  Matrix3f axes = solver.eigenvectors().rowwise().reverse();  // the largest first
-  if (axes.determinant() < 0) axes.col(2) *= -1;
-  const Eigen::Quaternionf q(axes);
-  Gaussians& g = to->gaussians;
-  g.mean.push_back(b.mean);
-  g.log_scale.push_back(solver.eigenvalues().reverse().cwiseMax(1e-8f).array().log().matrix() / 2);
-  g.rotation.emplace_back(q.w(), q.x(), q.y(), q.z());
-  g.opacity_logit.push_back(logitOf(b.opacity));
-  g.sh.insert(g.sh.end(), b.colour.data(), b.colour.data() + 3);
-  to->provenance.generated.push_back(b.generated);
-  to->provenance.probability.push_back(b.probability);
-}
-
-// What light a Gaussian takes on average over directions.
-float areaOf(const Matrix3f& covariance) {
-  const Vector3f v = Eigen::SelfAdjointEigenSolver<Matrix3f>(covariance, Eigen::EigenvaluesOnly)
-                         .eigenvalues()
-                         .cwiseMax(0.f)
-                         .cwiseSqrt();
-  return v[0] * v[1] + v[1] * v[2] + v[0] * v[2];
-}
-
-// One Gaussian with the moments of several and the light that they take together.
-Blob merged(const std::vector<Blob>& parts) {
-  Blob b;
-  float mass = 0;
-  std::vector<float> weights;
-  b.probability = parts[0].probability, b.generated = parts[0].generated;
-  for (const Blob& p : parts) {
-    const float w = p.opacity * areaOf(p.covariance) + 1e-12f;
-    weights.push_back(w);
-    mass += w, b.mean += w * p.mean, b.colour += w * p.colour;
-    b.probability = std::min(b.probability, p.probability);
-  }
-  b.mean /= mass, b.colour /= mass;
-  for (size_t i = 0; i < parts.size(); ++i) {
-    const Vector3f d = parts[i].mean - b.mean;
-    b.covariance += weights[i] / mass * (parts[i].covariance + d * d.transpose());
-  }
-  b.opacity = std::min(kMostOpacity, mass / areaOf(b.covariance));
+Blob scaled(Blob b, float by) {
+  b.covariance *= by * by;
   return b;
 }
 
@@ -108,9 +68,14 @@ class Bounds {
       : cameras_(cameras), slack_(slack) {
     RasterSettings raster;
     raster.antialias = discs.antialias, raster.median_depth = true;
-    for (const Camera& c : cameras_)
+    for (const Camera& c : cameras_) {
       depths_.push_back(rasterize(discs, c, raster).median_depth.data);
+      eye_ += c.world_from_camera.translation().cast<float>() / float(cameras_.size());
+    }
   }
+
+  // The mean camera, from the origin.
+  const Vector3f& eye() const { return eye_; }
 
   // Whether a view saw the surface at a point: its depth there is within `reach`.
   bool sees(const Vector3f& p, float reach) const {
@@ -122,24 +87,65 @@ class Bounds {
     return false;
   }
 
-  // Shrinks what reaches before a measured depth; false where its centre does.
-  bool clip(Blob* b) const {
-    const Matrix3f whole = b->covariance;
-    for (float shrink = 1; shrink >= kLeastShrink; shrink *= .7f) {
-      b->covariance = shrink * shrink * whole;
-      if (!standsBefore(*b)) return true;
-    }
-    return false;
-  }
+  bool standsBefore(const Blob& b) const { return offenceOf(b).found; }
 
-  // The mean camera, from the origin.
-  Vector3f meanEye() const {
-    Vector3d sum = Vector3d::Zero();
-    for (const Camera& c : cameras_) sum += c.world_from_camera.translation();
-    return (sum / double(std::max(size_t(1), cameras_.size()))).cast<float>();
+  // Cuts off what reaches before the discs, one side after the other, and moves away from the
+  // cameras what does so with its centre; false where neither helps. Shrinking or dropping instead
+  // leaves a black seam along the rim of what was seen.
+  bool clip(Blob* b) const {
+    const Vector3f away = (b->mean - eye_).normalized();
+    int pushes = 0;
+    for (int cuts = 0; cuts < kMostCuts;) {
+      const Offence offence = offenceOf(*b);
+      if (!offence.found) return true;
+      if (offence.side.isZero()) {
+        if (++pushes > kMostPushes) return false;
+        b->mean += kPush * away;
+      } else {
+        ++cuts;
+        b->mean -= (1 - kCut) * kFarSide * offence.side;
+        b->covariance -= (1 - kCut * kCut) * offence.side * offence.side.transpose();
+      }
+    }
+    return !offenceOf(*b).found;
   }
 
  private:
+  // Where a view would see a Gaussian before the discs: at its centre, or to a side (that of one
+  // sigma, from the centre).
+  struct Offence {
+    bool found = false;
+    Vector3f side = Vector3f::Zero();
+  };
+  Offence offenceOf(const Blob& b) const {
+    const Matrix3f inverse = (b.covariance + kLeastVariance * Matrix3f::Identity()).inverse();
+    for (size_t v = 0; v < cameras_.size(); ++v) {
+      const Matrix3f camera = cameras_[v].world_from_camera.linear().cast<float>();
+      // Of one sigma along the view; less of it towards the sides.
+      const float deep = 1 / std::sqrt(camera.col(2).dot(inverse * camera.col(2)));
+      const Vector3d centre = project(v, b.mean);
+      const auto before = [&](const Vector3d& uvz, float z) {
+        const float depth = depthAt(v, uvz);
+        return depth > 0 && z < depth - slack_;
+      };
+      if (before(centre, float(centre.z()) - deep)) return {true, Vector3f::Zero()};
+      for (int k = 0; k < 2 * kSideDirections; ++k) {
+        const float angle = float(M_PI) * float(k) / float(kSideDirections);
+        const Vector3f to_side = std::cos(angle) * camera.col(0) + std::sin(angle) * camera.col(1);
+        // To the ellipsoid's outermost point there.
+        const Vector3f along = b.covariance * to_side;
+        const Vector3f side = along / std::sqrt(to_side.dot(along) + kLeastVariance);
+        const Vector3d inner = project(v, b.mean + 1.5f * side),
+                       outer = project(v, b.mean + 3 * side);
+        // Gaussians are drawn in the order of their centres, which matters where they are opaque.
+        const float drawn_at = float(std::min(centre.z(), inner.z() - .75 * double(deep)));
+        if (before(inner, drawn_at) || before(outer, float(outer.z()) - .5f * deep))
+          return {true, side};
+      }
+    }
+    return {};
+  }
+
   Vector3d project(size_t view, const Vector3f& p) const {
     return cameras_[view].project(p.cast<double>());
   }
@@ -151,30 +157,9 @@ class Bounds {
     return depths_[view][size_t(uvz.y()) * size_t(c.width) + size_t(uvz.x())];
   }
 
-  bool standsBefore(const Blob& b) const {
-    for (size_t v = 0; v < cameras_.size(); ++v) {
-      const Matrix3f camera = cameras_[v].world_from_camera.linear().cast<float>();
-      const float deep = std::sqrt(camera.col(2).dot(b.covariance * camera.col(2)));
-      const auto before = [&](const Vector3f& p, float towards) {
-        const Vector3d uvz = project(v, p);
-        const float depth = depthAt(v, uvz);
-        return depth > 0 && float(uvz.z()) - towards < depth - slack_;
-      };
-      if (before(b.mean, deep)) return true;
-      for (int axis = 0; axis < 2; ++axis) {
-        // The ellipsoid's outermost point to that side.
-        const Vector3f along = b.covariance * camera.col(axis);
-        const Vector3f side = kSideSigmas / std::sqrt(camera.col(axis).dot(along) + 1e-12f) * along;
-        // Only half as deep there.
-        const float rest = .5f * std::min(deep, .05f);
-        if (before(b.mean + side, rest) || before(b.mean - side, rest)) return true;
-      }
-    }
-    return false;
-  }
-
   const std::vector<Camera>& cameras_;
   float slack_;
+  Vector3f eye_ = Vector3f::Zero();
   std::vector<std::vector<float>> depths_;  // [H * W] each; 0 where nothing was seen
 };
 
@@ -183,8 +168,9 @@ class Bounds {
 // Discs of one plane and where on it they are.
 struct SeenPlane {
   Vector3f point, normal;
-  Matrix3f axes;              // columns: two in the plane, then the normal
-  std::vector<size_t> discs;  // rows
+  Matrix3f axes;                 // columns: two in the plane, then the normal
+  std::vector<size_t> discs;     // rows
+  std::vector<Vector3f> places;  // of them, one in each cell of kPlaceCell
 
   float distance(const Vector3f& p) const { return normal.dot(p - point); }
 };
@@ -260,64 +246,185 @@ std::vector<SeenPlane> seenPlanes(const Gaussians& discs, const Vector3f& eye, u
                         std::back_inserter(rest));
     if (rest.size() == left.size()) break;
     left = std::move(rest);
+    std::unordered_set<uint64_t> taken;
+    for (size_t i : plane.discs)
+      if (taken.insert(cellOf(discs.mean[i], kPlaceCell)).second)
+        plane.places.push_back(discs.mean[i]);
     planes.push_back(std::move(plane));
   }
   return planes;
 }
 
-// The plane that a generated voxel continues; with the squared distances to its nearest discs.
-struct Continued {
-  const SeenPlane* plane = nullptr;
-  std::vector<std::pair<float, size_t>> near;
+// --- voxels -----------------------------------------------------------------------------------
+
+// One Gaussian for what a voxel has.
+struct Voxel {
+  Blob blob;
+  bool generated = false;  // whole; or else what no view saw of an observed voxel
+  bool meets_discs = false;
+  const SeenPlane* plane = nullptr;  // that it continues
+  std::vector<size_t> neighbours;    // rows
+  Matrix3f spread;                   // of its neighbours' means around it
 };
-Continued continuedBy(const Blob& voxel, const std::vector<SeenPlane>& planes,
-                      const Gaussians& discs, const JoinSettings& s) {
-  Continued best;
-  float least = s.off_plane_m;
-  for (const SeenPlane& plane : planes) {
-    const float off = std::abs(plane.distance(voxel.mean));
-    if (off >= least) continue;
-    std::vector<std::pair<float, size_t>> near;
-    for (size_t i : plane.discs) {
-      const float d = (discs.mean[i] - voxel.mean).squaredNorm();
-      if (d < s.reach_m * s.reach_m) near.emplace_back(d, i);
+
+// Of the decoded voxels what no view saw.
+std::vector<Voxel> unseenVoxels(const Gaussians& decoded, const Provenance& provenance,
+                                int per_voxel, const Bounds& bounds, const JoinSettings& s) {
+  std::vector<Voxel> all(size_t(decoded.size() / per_voxel));
+  std::vector<uint8_t> is_left(all.size());
+  tbb::parallel_for(size_t(0), all.size(), [&](size_t v) {
+    const size_t begin = v * size_t(per_voxel);
+    all[v].generated = provenance.generated[begin];
+    std::vector<Blob> parts;
+    for (size_t i = begin; i < begin + size_t(per_voxel); ++i) {
+      if (!all[v].generated && bounds.sees(decoded.mean[i], s.voxel_m)) continue;
+      parts.push_back(blobOf(decoded, i));
+      parts.back().probability = provenance.probability[i];
     }
-    if (near.empty()) continue;
-    const size_t keep = std::min(near.size(), size_t(kNearDiscs));
-    std::partial_sort(near.begin(), near.begin() + std::ptrdiff_t(keep), near.end());
-    near.resize(keep);
-    least = off, best = {&plane, std::move(near)};
-  }
-  return best;
+    if (parts.empty()) return;
+    all[v].blob = merged(parts);
+    is_left[v] = 1;
+  });
+  std::vector<Voxel> left;
+  for (size_t v = 0; v < all.size(); ++v)
+    if (is_left[v]) left.push_back(std::move(all[v]));
+  return left;
 }
 
-Blob continuedPlane(const Blob& voxel, const Continued& c, const Gaussians& discs,
-                    const JoinSettings& s) {
-  Blob b = voxel;
-  b.mean -= (c.plane->distance(voxel.mean) + kBehind) * c.plane->normal;
-  const float sigma = kPlaneSigma * s.voxel_m;
-  const Vector3f v(sigma * sigma, sigma * sigma, kPlaneThickness * kPlaneThickness);
-  b.covariance = c.plane->axes * v.asDiagonal() * c.plane->axes.transpose();
+void linkNeighbours(float voxel_m, std::vector<Voxel>* voxels) {
+  std::vector<Vector3f> means;
+  for (const Voxel& v : *voxels) means.push_back(v.blob.mean);
+  const PointCells cells(means, kTouching * voxel_m);
+  tbb::parallel_for(size_t(0), voxels->size(), [&](size_t i) {
+    cells.near(means[i], [&](size_t k, float) {
+      if (k != i) (*voxels)[i].neighbours.push_back(k);
+    });
+  });
+}
+
+// How a voxel and its neighbours lie: the covariance of their means.
+Matrix3f spreadAround(const Voxel& v, const std::vector<Voxel>& voxels) {
+  const float n = float(v.neighbours.size() + 1);
+  Vector3f mean = v.blob.mean / n;
+  for (size_t k : v.neighbours) mean += voxels[k].blob.mean / n;
+  const auto square = [&](const Vector3f& p) -> Matrix3f {
+    return (p - mean) * (p - mean).transpose() / n;
+  };
+  Matrix3f spread = square(v.blob.mean);
+  for (size_t k : v.neighbours) spread += square(voxels[k].blob.mean);
+  return spread;
+}
+
+// Whether they lie in one sheet across a normal: a wall at the height of a table is no part of the
+// table's plane.
+bool liesAcross(const Vector3f& normal, const Matrix3f& spread) {
+  const float along = normal.dot(spread * normal);
+  return along <= kMostAcross * (spread.trace() - along) / 2;
+}
+
+// The nearest plane that goes on to a voxel; null where none does.
+const SeenPlane* planeAt(const Voxel& v, const std::vector<SeenPlane>& planes,
+                         const JoinSettings& s) {
+  const SeenPlane* nearest = nullptr;
+  float least = s.off_plane_m;
+  for (const SeenPlane& plane : planes) {
+    const float off = std::abs(plane.distance(v.blob.mean));
+    const auto reaches = [&](const Vector3f& q) {
+      return (q - v.blob.mean).squaredNorm() < s.reach_m * s.reach_m;
+    };
+    if (off < least && std::any_of(plane.places.begin(), plane.places.end(), reaches) &&
+        liesAcross(plane.normal, v.spread))
+      least = off, nearest = &plane;
+  }
+  return nearest;
+}
+
+// How the discs around a voxel differ from it in colour; those of its plane, where it continues
+// one.
+Vector3f differenceAtRim(const Gaussians& discs, const PointCells& disc_cells, float voxel_m,
+                         Voxel* v) {
+  const float sigma = kRimSigma * voxel_m;
+  Vector3f sum = Vector3f::Zero();
+  float mass = 0;
+  disc_cells.near(v->blob.mean, [&](size_t d, float squared) {
+    if (v->plane && std::abs(v->plane->distance(discs.mean[d])) > kPlaneSlack) return;
+    const Vector3f sigmas = discs.log_scale[d].array().exp();
+    const float area = sigmas.prod() / sigmas.minCoeff();
+    const float w = area * std::exp(-squared / (2 * sigma * sigma));
+    mass += w, sum += w * (Eigen::Map<const Vector3f>(&discs.sh[3 * d]) - v->blob.colour);
+  });
+  v->meets_discs = mass > 0;
+  return v->meets_discs ? Vector3f(sum / mass) : Vector3f::Zero();
+}
+
+// Fits the colours of what was generated to those of the discs where both meet, and carries the
+// difference on, fading: a screened Poisson equation over the voxels, by relaxation.
+void fitColours(const Gaussians& discs, const PointCells& disc_cells, float voxel_m,
+                std::vector<Voxel>* voxels) {
+  const size_t n = voxels->size();
+  std::vector<Vector3f> at_rim(n), offset(n, Vector3f::Zero()), next(n);
+  tbb::parallel_for(size_t(0), n, [&](size_t i) {
+    at_rim[i] = differenceAtRim(discs, disc_cells, voxel_m, &(*voxels)[i]);
+  });
+  for (int round = 0; round < kRounds; ++round) {
+    tbb::parallel_for(size_t(0), n, [&](size_t i) {
+      const Voxel& v = (*voxels)[i];
+      const float pull = v.meets_discs ? kRimPull : 0;
+      Vector3f sum = pull * at_rim[i];
+      for (size_t k : v.neighbours) sum += offset[k];
+      next[i] = sum / (pull + kLeak + float(v.neighbours.size()));
+    });
+    std::swap(offset, next);
+  }
+  for (size_t i = 0; i < n; ++i) (*voxels)[i].blob.colour += offset[i];
+}
+
+// As it is drawn: a flat disc a little behind what was seen of the plane that it continues, or else
+// wider than the decoder's Gaussians, which leave gaps between voxels.
+Blob drawn(const Voxel& v, float voxel_m) {
+  if (!v.plane) {
+    Blob b = scaled(v.blob, kWiden);
+    b.opacity = std::max(b.opacity, kLeastOpacity);
+    return b;
+  }
+  Blob b = v.blob;
+  b.mean -= (v.plane->distance(b.mean) + kBehind) * v.plane->normal;
+  const float sigma = kPlaneSigma * voxel_m;
+  const Vector3f sigmas(sigma, sigma, kPlaneThickness);
+  const Matrix3f axes = v.plane->axes * sigmas.asDiagonal();
+  b.covariance = axes * axes.transpose();
   b.opacity = kMostOpacity;
-  Vector3f colour = Vector3f::Zero();
-  for (const auto& near : c.near) colour += Eigen::Map<const Vector3f>(&discs.sh[3 * near.second]);
-  b.colour += s.plane_colour * (colour / float(c.near.size()) - b.colour);
   return b;
 }
 
-// --- voxels -----------------------------------------------------------------------------------
-
-std::vector<Blob> voxelBlobs(const Gaussians& g, const Provenance& p, size_t begin, size_t end) {
-  std::vector<Blob> blobs;
-  for (size_t i = begin; i < end; ++i) {
-    Blob b;
-    b.mean = g.mean[i], b.colour = Eigen::Map<const Vector3f>(&g.sh[3 * i]);
-    b.covariance = covarianceOf(g, i);
-    b.opacity = opacityOf(g.opacity_logit[i]);
-    b.probability = p.probability[i], b.generated = p.generated[i];
-    blobs.push_back(b);
+// What may be seen of the voxels, merged where neighbours agree and no disc is near.
+std::vector<Blob> visibleBlobs(const std::vector<Voxel>& voxels, const Bounds& bounds,
+                               float voxel_m) {
+  enum Fate : uint8_t { kDropped, kAlone, kMerged };
+  std::vector<Fate> fates(voxels.size(), kDropped);
+  std::vector<Blob> blobs(voxels.size());
+  tbb::parallel_for(size_t(0), voxels.size(), [&](size_t i) {
+    blobs[i] = drawn(voxels[i], voxel_m);
+    // What a view saw there is a disc already.
+    if (voxels[i].generated && bounds.sees(blobs[i].mean, voxel_m)) return;
+    if (!bounds.standsBefore(blobs[i]))
+      fates[i] = voxels[i].meets_discs ? kAlone : kMerged;
+    else if (bounds.clip(&blobs[i]))
+      fates[i] = kAlone;
+  });
+  // Gaussians that overlap have to be tiles before their moments add up to those of a larger tile.
+  std::vector<Blob> tiles, visible;
+  for (size_t i = 0; i < voxels.size(); ++i) {
+    if (fates[i] == kMerged) tiles.push_back(scaled(blobs[i], 1 / kTileSigmas));
+    if (fates[i] == kAlone) visible.push_back(blobs[i]);
   }
-  return blobs;
+  MergeSettings merging;
+  merging.cell_m = 2 * voxel_m;
+  tiles = mergeAlike(tiles, merging, [&](const Blob& tile) {
+    return !bounds.standsBefore(scaled(tile, kTileSigmas));
+  });
+  for (const Blob& tile : tiles) visible.push_back(scaled(tile, kTileSigmas));
+  return visible;
 }
 
 }  // namespace
@@ -336,40 +443,26 @@ SplatScene join(const Gaussians& world_discs, const Gaussians& decoded,
           "provenance");
   discs.origin.setZero();
   const Bounds bounds(discs, cameras, s.slack_m);
-  const std::vector<SeenPlane> planes = seenPlanes(discs, bounds.meanEye(), s.seed);
-  const size_t voxels = size_t(decoded.size() / per_voxel);
-  std::vector<std::vector<Blob>> kept(voxels);
-  tbb::parallel_for(size_t(0), voxels, [&](size_t v) {
-    const size_t begin = v * size_t(per_voxel), end = begin + size_t(per_voxel);
-    std::vector<Blob> parts = voxelBlobs(decoded, provenance, begin, end);
-    if (!parts[0].generated) {
-      parts.erase(std::remove_if(parts.begin(), parts.end(),
-                                 [&](const Blob& b) { return bounds.sees(b.mean, s.voxel_m); }),
-                  parts.end());
-      for (Blob& b : parts) b.generated = true;
-    } else {
-      Blob whole = merged(parts);
-      const Continued continued = continuedBy(whole, planes, discs, s);
-      if (!continued.plane) {
-        // The decoder's Gaussians leave gaps between voxels; one that is wider does not.
-        whole.covariance *= kWiden * kWiden, whole.opacity = std::max(whole.opacity, kLeastOpacity);
-        parts = {whole};
-      } else {
-        parts = {continuedPlane(whole, continued, discs, s)};
-        // What a view saw there is a disc already.
-        if (bounds.sees(parts[0].mean, s.voxel_m)) parts.clear();
-      }
-    }
-    for (Blob& b : parts)
-      if (!(b.generated && bounds.sees(b.mean, s.voxel_m)) && bounds.clip(&b)) kept[v].push_back(b);
+  const std::vector<SeenPlane> planes = seenPlanes(discs, bounds.eye(), s.seed);
+  const PointCells disc_cells(discs.mean, kRim * s.voxel_m);
+  std::vector<Voxel> voxels = unseenVoxels(decoded, provenance, per_voxel, bounds, s);
+  linkNeighbours(s.voxel_m, &voxels);
+  tbb::parallel_for(size_t(0), voxels.size(), [&](size_t i) {
+    voxels[i].spread = spreadAround(voxels[i], voxels);
+    voxels[i].plane = planeAt(voxels[i], planes, s);
   });
+  fitColours(discs, disc_cells, s.voxel_m, &voxels);
+  const std::vector<Blob> generated = visibleBlobs(voxels, bounds, s.voxel_m);
   SplatScene scene;
   scene.gaussians = std::move(discs);
   scene.gaussians.origin = decoded.origin;
   scene.provenance.generated.assign(scene.gaussians.mean.size(), 0);
   scene.provenance.probability.assign(scene.gaussians.mean.size(), 1.f);
-  for (const auto& blobs : kept)
-    for (const Blob& b : blobs) appendBlob(b, &scene);
+  for (const Blob& b : generated) {
+    appendBlob(b, &scene.gaussians);
+    scene.provenance.generated.push_back(1);
+    scene.provenance.probability.push_back(b.probability);
+  }
   return scene;
 }
 

@@ -11,8 +11,7 @@ struct JoinSettings {
   float voxel_m = .1f;       // edge of the decoded voxels
   float slack_m = .01f;      // what stands no farther in front of a measured depth may stay
   float off_plane_m = .05f;  // generated voxels within lie in a seen plane that goes on
-  float reach_m = 3;         // how far beyond its discs a seen plane goes on
-  float plane_colour = .3f;  // share of the seen plane's colour in what continues it
+  float reach_m = 1.5f;      // how far beyond its discs a seen plane goes on
   uint64_t seed = 1;         // of the search for planes
 };
 
@@ -23,11 +22,13 @@ struct SplatScene {
 };
 
 /// `discs` (all observed), then what is left of the decoded Gaussians, `per_voxel` to a voxel:
-/// - those of voxels that no view generated give way where a view saw their surface; the rest of
+/// - those of voxels that were not generated give way where a view saw their surface; the rest of
 ///   them count as generated, for no view saw what they show;
-/// - generated voxels that continue a plane of the discs become one flat disc in it;
+/// - what is left of a voxel becomes one Gaussian, or one flat disc where it continues a plane of
+///   the discs; neighbours that agree become one, away from the discs;
+/// - their colours are fitted to those of the discs where both meet, and less so farther away;
 /// - what comes before the discs in one of the `cameras`, those of the views that the discs were
-///   made of, is shrunk, or else dropped.
+///   made of, is moved behind them or shrunk, or else dropped.
 /// Origins have to be equal. Parallel; the same bytes for any number of threads. Throws Error where
 /// rows do not fit each other.
 SplatScene join(const Gaussians& discs, const Gaussians& decoded, const Provenance& provenance,

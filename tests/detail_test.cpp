@@ -17,6 +17,7 @@ namespace {
 
 using Eigen::Vector3d;
 using Eigen::Vector3f;
+using Eigen::Vector4f;
 
 const Vector3d kRoom(4.2, 3.4, 2.6);  // metres, from the world's origin
 
@@ -276,6 +277,105 @@ TEST(Join, SeenPlanesGoOnAsDiscsInThem) {
   const Vector3f sigma = j.scene.gaussians.log_scale[last].array().exp();
   EXPECT_LT(sigma.minCoeff(), .01f);
   EXPECT_GT(sigma.maxCoeff(), .05f);
+}
+
+/// The plain wall at x = 4.2, of which one view saw a part, decoded whole and farther on, in
+/// another colour.
+struct HalfSeenWall {
+  std::vector<View> views = {viewFrom({1.2, 1.7, 1.3}, {kRoom.x(), .4, 1.3})};
+  Vector3f seen_colour = {.6f, .5f, .4f}, generated_colour = {.75f, .5f, .3f};
+  Gaussians discs;
+  SplatScene scene;
+  float rim = 0;  // y, metres: how far the discs go
+
+  explicit HalfSeenWall(double seconds = .2) : discs(discsOf(views, seconds)) {
+    Joined j;
+    for (float y = .05f; y < 5; y += .1f)
+      for (float z = .45f; z < 2.2f; z += .1f)
+        addVoxel({float(kRoom.x()) + .02f, y, z}, generated_colour, true, &j.decoded,
+                 &j.provenance);
+    scene = join(discs, j.decoded, j.provenance, 8, {views[0].camera}, {});
+    for (const Vector3f& p : discs.mean)
+      if (std::abs(p.x() - kRoom.x()) < .05 && std::abs(p.z() - 1.3) < .5)
+        rim = std::max(rim, p.y());
+  }
+
+  size_t generatedRows() const { return scene.gaussians.mean.size() - discs.mean.size(); }
+  /// Calls visit(row, metres beyond the rim) for generated Gaussians.
+  template <typename Visit>
+  void eachGenerated(const Visit& visit) const {
+    for (size_t i = discs.mean.size(); i < scene.gaussians.mean.size(); ++i)
+      visit(i, scene.gaussians.mean[i].y() - rim);
+  }
+};
+
+TEST(Join, ContinuedPlanesAreLevel) {
+  const HalfSeenWall wall(1e-9);  // exactly on the plane
+  size_t flat = 0;
+  wall.eachGenerated([&](size_t i, float beyond) {
+    if (beyond > 1.2f) return;
+    const Gaussians& g = wall.scene.gaussians;
+    const Vector3f sigma = g.log_scale[i].array().exp();
+    const Vector4f& q = g.rotation[i];
+    const Vector3f normal = Eigen::Quaternionf(q[0], q[1], q[2], q[3]).matrix().col(2);
+    ++flat;
+    EXPECT_LT(sigma[2], .02f);
+    EXPECT_GT(std::abs(normal.x()), std::cos(.5f * float(M_PI) / 180));
+    EXPECT_NEAR(g.mean[i].x(), kRoom.x(), .015);
+  });
+  EXPECT_GT(flat, 20u);
+}
+
+TEST(Join, ColoursOfBothSidesMeetAndPartFartherOn) {
+  const HalfSeenWall wall;
+  float near = 0, far = 0;
+  wall.eachGenerated([&](size_t i, float beyond) {
+    const Vector3f colour = Vector3f::Constant(.5f) +
+                            kSh0 * Eigen::Map<const Vector3f>(&wall.scene.gaussians.sh[3 * i]);
+    if (beyond < .2f) near = std::max(near, (colour - wall.seen_colour).norm());
+    if (beyond > 2) far = std::max(far, (colour - wall.generated_colour).norm());
+  });
+  EXPECT_LT(near, .03f);  // they are .18 apart
+  EXPECT_LT(far, .09f);
+}
+
+TEST(Join, NoSeamAlongTheRimOfWhatWasSeen) {
+  const HalfSeenWall wall;
+  const View other = viewFrom({1.5, wall.rim + .3, 1.3}, {kRoom.x(), wall.rim, 1.3});
+  RasterSettings raster;
+  raster.antialias = true;
+  const RasterOutput seen = rasterize(wall.scene.gaussians, other.camera, raster);
+  for (int y = 28; y < 44; ++y)
+    for (int x = 20; x < 76; ++x) {
+      EXPECT_GT(seen.alpha.at(x, y, 0), .9f) << x << ' ' << y;
+      const float step = std::abs(seen.colour.at(x, y, 0) - seen.colour.at(x - 1, y, 0));
+      EXPECT_LT(step, .03f) << x << ' ' << y;
+    }
+}
+
+TEST(Join, AGeneratedWallIsFewGaussiansOfTheLowestProbability) {
+  const HalfSeenWall wall;
+  size_t far = 0, voxels = 0;
+  wall.eachGenerated([&](size_t i, float beyond) {
+    EXPECT_EQ(wall.scene.provenance.generated[i], 1);
+    EXPECT_FLOAT_EQ(wall.scene.provenance.probability[i], .63f);
+    far += beyond > .5f;
+  });
+  voxels = size_t((5 - wall.rim - .5f) / .1f * 18);
+  EXPECT_GT(far, voxels / 6);
+  EXPECT_LT(far, voxels / 3);
+}
+
+TEST(Join, WhatCrossesASeenPlaneKeepsItsShape) {
+  // Exactly on the plane of the plain wall, which a sheet of voxels crosses beyond its rim.
+  const std::vector<View> views = {viewFrom({1.2, 1.7, 1.3}, {kRoom.x(), .4, 1.3})};
+  const Gaussians discs = discsOf(views, 1e-9);
+  std::vector<std::pair<Vector3f, bool>> voxels;
+  for (float x = 3.95f; x < 4.5f; x += .1f)
+    for (float z = .85f; z < 1.8f; z += .1f) voxels.push_back({{x, 3.2f, z}, true});
+  const Gaussians g = joinWith(voxels, discs, views).scene.gaussians;
+  for (size_t i = size_t(discs.size()); i < g.mean.size(); ++i)
+    EXPECT_GT(g.log_scale[i].minCoeff(), std::log(.02f)) << g.mean[i].transpose();
 }
 
 TEST(Join, TheSameBytesForAnyNumberOfThreads) {

@@ -22,11 +22,11 @@ job() {
 "
 }
 for views in 2 4 12; do
-  for seconds in 0.001 .5 1 2 4; do job "rooms-$views" $seconds "$rooms" $views; done
+  for seconds in .01 .25 .5 1 2 5; do job "rooms-$views" $seconds "$rooms" $views; done
 done
 if [ -d "$data/rgbd_redkitchen" ]; then
-  for seconds in 0.001 .5 1 2 4 8; do job kitchen-4 $seconds "$data/rgbd_redkitchen" 4 --frames 0,6,12,18; done
-  for seconds in 0.001 .5 1 2 4 8; do
+  for seconds in .01 .25 .5 1 2 5 10; do job kitchen-4 $seconds "$data/rgbd_redkitchen" 4 --frames 0,6,12,18; done
+  for seconds in .01 .25 .5 1 2 5 10; do
     job kitchen-12 $seconds "$data/rgbd_redkitchen" 12 --frames 0,2,4,6,8,10,12,14,16,18,20,22
   done
 fi
@@ -38,10 +38,10 @@ set terminal svg size 900,380 font "sans,13" background "white"
 set output "../detail.svg"
 set datafile separator ","; set datafile columnheaders
 of(kind, column_) = word(strcol("configuration"), 1) eq kind ? column(column_) : NaN
-at(kind) = word(strcol("configuration"), 1) eq kind ? column("encode_seconds") : NaN
+at(kind) = word(strcol("configuration"), 1) eq kind ? real(word(strcol("configuration"), 2)) : NaN
 set multiplot layout 1,2
 set grid; set key bottom right; set logscale x
-set xlabel "seconds from views to discs"; set ylabel "PSNR [dB]"
+set xlabel "--detail [s]"; set ylabel "PSNR [dB]"
 set title "Where views saw: input views"
 plot for [kind in "rooms-2 rooms-4 rooms-12 kitchen-4 kitchen-12"] "detail.csv" using (at(kind)):(of(kind, "input_psnr")) with linespoints title kind
 set title "Where views saw: other views"
