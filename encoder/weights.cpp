@@ -31,7 +31,8 @@ torch::ScalarType typeOf(const std::string& name, const std::string& path) {
   if (name == "F16") return torch::kFloat16;
   if (name == "I32") return torch::kInt32;
   if (name == "I64") return torch::kInt64;
-  throw Error(joinText("readTensors: ", path, ": expected dtype F16, F32, I32 or I64, found ", name));
+  throw Error(
+      joinText("readTensors: ", path, ": expected dtype F16, F32, I32 or I64, found ", name));
 }
 
 }  // namespace

@@ -248,9 +248,13 @@ TEST_F(Program, BundledViewsCompleteToFiveFiles) {
   EXPECT_GT(std::count(voxels.observed.begin(), voxels.observed.end(), 1), 0);
   EXPECT_GT(std::count(voxels.observed.begin(), voxels.observed.end(), 0), 0)
       << "nothing was generated";
-  EXPECT_GE(gaussians, int64_t(voxels.ijk.size()));
   Provenance provenance;
   EXPECT_EQ(readPointsVdb(output_ + "/x.points.vdb", &provenance).size(), gaussians);
+  const auto generated =
+      std::count(provenance.generated.begin(), provenance.generated.end(), uint8_t(1));
+  EXPECT_GT(generated, 1000);
+  EXPECT_GT(gaussians - generated, 1000);
+  EXPECT_LT(gaussians, int64_t(voxels.ijk.size())) << "walls are not merged";
   const Image sheet = readImage(output_ + "/x.png");
   EXPECT_GT(sheet.width * sheet.height, 100 * 100);
 }

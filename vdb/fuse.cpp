@@ -21,7 +21,7 @@ constexpr double kFinest = .01, kCoarsest = .05;  // metres
 constexpr int kCell = 4;                          // pixels over whose means slopes are taken
 constexpr double kSameSurface = .03;              // of 1/z: neighbours within are one surface
 constexpr double kLeastCosine = .1;
-constexpr float kShell = .67f;        // of the band: how thick at least what was measured is
+constexpr float kShell = .67f;  // of the band: how thick at least what was measured is
 
 // Round distances make small files, and those most whose last bits are 0.
 float stepOf(float band) {
