@@ -21,32 +21,35 @@ using Eigen::Matrix3f;
 using Eigen::Vector3d;
 using Eigen::Vector3f;
 
-constexpr int kMostPlanes = 16, kPlaneDraws = 48;
+constexpr int kMostPlanes = 16, kPlaneDraws = 48, kPlaneRounds = 3;
 constexpr float kPlaneSlack = .03f;       // metres; discs within are of a plane
 constexpr float kPlaneCosine = .9f;       // of their normals
 constexpr float kPlaceCell = .5f;         // metres
 constexpr float kLeastPlane = .1f;        // m^2 of discs
-constexpr float kPlaneSigma = .8f;        // of a disc that continues a plane, voxels
+constexpr float kPlaneSigma = .9f;        // of a disc that continues a plane, voxels
 constexpr float kPlaneThickness = .003f;  // metres
-constexpr float kBehind = .01f;  // metres; what continues a plane lies behind what was seen of it
+constexpr float kBehind = .03f;  // metres; what continues a plane lies behind what was seen of it
 
-constexpr int kSideDirections = 4;  // to both sides each, in which a Gaussian is looked at
+constexpr int kSideDirections = 4;          // to both sides each, in which a Gaussian is looked at
+constexpr float kInner = 1.3f, kOuter = 3;  // sigmas
 constexpr int kMostCuts = 8, kMostPushes = 2;
 constexpr float kCut = .7f;              // what a cut leaves of a Gaussian's width
-constexpr float kFarSide = 2;            // sigmas to the other side, which stays where it is
+constexpr float kFarSide = 3;            // sigmas to the other side, which stays where it is
 constexpr float kPush = .03f;            // metres
 constexpr float kLeastVariance = 1e-8f;  // m^2
 
 constexpr float kMostAcross = .5f;  // of the variance within a sheet, that across it
 
-constexpr float kTouching = 1.8f;  // voxels between centres of neighbours: also across corners
-constexpr float kRim = 3;          // voxels; discs within meet what was generated
-constexpr float kRimSigma = 1;     // voxels; nearer ones count more
-constexpr float kRimPull = 10;     // of a colour where both meet, against that of a neighbour
+constexpr float kTouching = 1.8f;   // voxels between centres of neighbours: also across corners
+constexpr float kRim = 3;           // voxels; discs within meet what was generated
+constexpr float kRimSigma = 1;      // voxels; nearer ones count more
+constexpr float kRimPull = 10;      // of a colour where both meet, against that of a neighbour
+constexpr float kCovered = .3f;     // of a voxel's face by discs: where the pull is whole
+constexpr float kOtherThing = .3f;  // display sRGB
 constexpr float kLeak = .05f;  // of a difference in colour on its way from voxel to voxel: a metre
 constexpr int kRounds = 60;
 
-constexpr float kWiden = 1.5f, kLeastOpacity = .95f;  // of a voxel's Gaussian
+constexpr float kWiden = 1.4f, kLeastOpacity = .95f;  // of a voxel's Gaussian
 constexpr float kTileSigmas = 2.6f;                   // by which tiles are widened to close up
 
 Matrix3f axesOf(const Eigen::Vector4f& q) {
@@ -135,8 +138,8 @@ class Bounds {
         // To the ellipsoid's outermost point there.
         const Vector3f along = b.covariance * to_side;
         const Vector3f side = along / std::sqrt(to_side.dot(along) + kLeastVariance);
-        const Vector3d inner = project(v, b.mean + 1.5f * side),
-                       outer = project(v, b.mean + 3 * side);
+        const Vector3d inner = project(v, b.mean + kInner * side),
+                       outer = project(v, b.mean + kOuter * side);
         // Gaussians are drawn in the order of their centres, which matters where they are opaque.
         const float drawn_at = float(std::min(centre.z(), inner.z() - .75 * double(deep)));
         if (before(inner, drawn_at) || before(outer, float(outer.z()) - .5f * deep))
@@ -167,10 +170,10 @@ class Bounds {
 
 // Discs of one plane and where on it they are.
 struct SeenPlane {
-  Vector3f point, normal;
-  Matrix3f axes;                 // columns: two in the plane, then the normal
-  std::vector<size_t> discs;     // rows
-  std::vector<Vector3f> places;  // of them, one in each cell of kPlaceCell
+  Vector3f point = Vector3f::Zero(), normal = Vector3f::Zero();
+  Matrix3f axes = Matrix3f::Identity();  // columns: two in the plane, then the normal
+  std::vector<size_t> discs;             // rows
+  std::vector<Vector3f> places;          // of them, one in each cell of kPlaceCell
 
   float distance(const Vector3f& p) const { return normal.dot(p - point); }
 };
@@ -180,71 +183,88 @@ struct DiscShape {
   float area;
 };
 
-// Up to kMostPlanes by consensus, the largest first.
-std::vector<SeenPlane> seenPlanes(const Gaussians& discs, const Vector3f& eye, uint64_t seed) {
-  const size_t n = discs.mean.size();
-  std::vector<DiscShape> shapes(n);
-  for (size_t i = 0; i < n; ++i) {
+bool liesOn(const SeenPlane& plane, const Vector3f& mean, const DiscShape& shape) {
+  return std::abs(plane.distance(mean)) < kPlaneSlack &&
+         std::abs(plane.normal.dot(shape.normal)) > kPlaneCosine;
+}
+
+std::vector<DiscShape> shapesOf(const Gaussians& discs) {
+  std::vector<DiscShape> shapes;
+  for (size_t i = 0; i < discs.mean.size(); ++i) {
     // The thinnest axis, which fitting may have made another one.
     Eigen::Index thin = 0;
     discs.log_scale[i].minCoeff(&thin);
     const Vector3f sigma = discs.log_scale[i].array().exp();
-    shapes[i] = {axesOf(discs.rotation[i]).col(thin), 4 * sigma.prod() / sigma[thin]};
+    shapes.push_back({axesOf(discs.rotation[i]).col(thin), 4 * sigma.prod() / sigma[thin]});
   }
-  std::vector<size_t> left(n);
+  return shapes;
+}
+
+// The discs of `left` that lie on a plane, and the plane through them, towards the cameras.
+void refit(const Gaussians& discs, const std::vector<DiscShape>& shapes,
+           const std::vector<size_t>& left, const Vector3f& eye, SeenPlane* plane) {
+  Vector3d mean = Vector3d::Zero();
+  double mass = 0;
+  plane->discs.clear();
+  for (size_t i : left)
+    if (liesOn(*plane, discs.mean[i], shapes[i])) {
+      plane->discs.push_back(i);
+      mean += double(shapes[i].area) * discs.mean[i].cast<double>();
+      mass += double(shapes[i].area);
+    }
+  mean /= mass;
+  Eigen::Matrix3d spread = Eigen::Matrix3d::Zero();
+  for (size_t i : plane->discs) {
+    const Vector3d d = discs.mean[i].cast<double>() - mean;
+    spread += double(shapes[i].area) * d * d.transpose();
+  }
+  const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> solver(spread);
+  plane->point = mean.cast<float>();
+  plane->normal = solver.eigenvectors().col(0).cast<float>();
+  if (plane->normal.dot(eye - plane->point) < 0) plane->normal *= -1;
+  plane->axes << solver.eigenvectors().col(2).cast<float>(),
+      solver.eigenvectors().col(1).cast<float>(), plane->normal;
+}
+
+// Of planes through some discs, drawn by their areas, the one with the largest area of discs on it.
+SeenPlane consensus(const Gaussians& discs, const std::vector<DiscShape>& shapes,
+                    const std::vector<size_t>& left, std::mt19937_64* random, float* area) {
+  std::vector<double> sums;
+  double sum = 0;
+  for (size_t i : left) sums.push_back(sum += double(shapes[i].area));
+  std::vector<SeenPlane> drawn(kPlaneDraws);
+  for (SeenPlane& plane : drawn) {
+    const double at = sum * double((*random)() >> 11) * 0x1p-53;
+    const size_t k = size_t(std::upper_bound(sums.begin(), sums.end(), at) - sums.begin());
+    const size_t i = left[std::min(k, left.size() - 1)];
+    plane.point = discs.mean[i], plane.normal = shapes[i].normal;
+  }
+  std::vector<float> areas(drawn.size(), 0.f);
+  tbb::parallel_for(size_t(0), drawn.size(), [&](size_t k) {
+    for (size_t i : left)
+      if (liesOn(drawn[k], discs.mean[i], shapes[i])) areas[k] += shapes[i].area;
+  });
+  const auto best = std::max_element(areas.begin(), areas.end());
+  *area = *best;
+  return drawn[size_t(best - areas.begin())];
+}
+
+// Up to kMostPlanes, the largest first.
+std::vector<SeenPlane> seenPlanes(const Gaussians& discs, const Vector3f& eye, uint64_t seed) {
+  const std::vector<DiscShape> shapes = shapesOf(discs);
+  std::vector<size_t> left(shapes.size());
   std::iota(left.begin(), left.end(), size_t(0));
   std::mt19937_64 random(seed);
   std::vector<SeenPlane> planes;
-  const auto belongs = [&](size_t i, const Vector3f& p, const Vector3f& normal) {
-    return std::abs(normal.dot(discs.mean[i] - p)) < kPlaneSlack &&
-           std::abs(normal.dot(shapes[i].normal)) > kPlaneCosine;
-  };
   while (planes.size() < kMostPlanes && !left.empty()) {
-    std::vector<double> sums;
-    double sum = 0;
-    for (size_t i : left) sums.push_back(sum += double(shapes[i].area));
-    std::vector<size_t> draws;
-    for (int k = 0; k < kPlaneDraws; ++k) {
-      const double at = sum * double(random() >> 11) * 0x1p-53;
-      const size_t i = size_t(std::upper_bound(sums.begin(), sums.end(), at) - sums.begin());
-      draws.push_back(left[std::min(i, left.size() - 1)]);
-    }
-    std::vector<float> areas(draws.size(), 0.f);
-    tbb::parallel_for(size_t(0), draws.size(), [&](size_t k) {
-      for (size_t i : left)
-        if (belongs(i, discs.mean[draws[k]], shapes[draws[k]].normal)) areas[k] += shapes[i].area;
-    });
-    const size_t best = size_t(std::max_element(areas.begin(), areas.end()) - areas.begin());
-    if (areas[best] < kLeastPlane) break;
-    SeenPlane plane;
-    plane.point = discs.mean[draws[best]], plane.normal = shapes[draws[best]].normal;
-    for (int round = 0; round < 3; ++round) {
-      Vector3d mean = Vector3d::Zero();
-      double mass = 0;
-      plane.discs.clear();
-      for (size_t i : left)
-        if (belongs(i, plane.point, plane.normal)) {
-          plane.discs.push_back(i);
-          mean += double(shapes[i].area) * discs.mean[i].cast<double>();
-          mass += double(shapes[i].area);
-        }
-      mean /= mass;
-      Eigen::Matrix3d spread = Eigen::Matrix3d::Zero();
-      for (size_t i : plane.discs) {
-        const Vector3d d = discs.mean[i].cast<double>() - mean;
-        spread += double(shapes[i].area) * d * d.transpose();
-      }
-      const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> solver(spread);
-      plane.point = mean.cast<float>();
-      plane.normal = solver.eigenvectors().col(0).cast<float>();
-      if (plane.normal.dot(eye - plane.point) < 0) plane.normal *= -1;
-      plane.axes << solver.eigenvectors().col(2).cast<float>(),
-          solver.eigenvectors().col(1).cast<float>(), plane.normal;
-    }
+    float area = 0;
+    SeenPlane plane = consensus(discs, shapes, left, &random, &area);
+    if (area < kLeastPlane) break;
+    for (int round = 0; round < kPlaneRounds; ++round) refit(discs, shapes, left, eye, &plane);
+    if (plane.discs.empty()) break;
     std::vector<size_t> rest;
     std::set_difference(left.begin(), left.end(), plane.discs.begin(), plane.discs.end(),
                         std::back_inserter(rest));
-    if (rest.size() == left.size()) break;
     left = std::move(rest);
     std::unordered_set<uint64_t> taken;
     for (size_t i : plane.discs)
@@ -260,11 +280,11 @@ std::vector<SeenPlane> seenPlanes(const Gaussians& discs, const Vector3f& eye, u
 // One Gaussian for what a voxel has.
 struct Voxel {
   Blob blob;
-  bool generated = false;  // whole; or else what no view saw of an observed voxel
-  bool meets_discs = false;
-  const SeenPlane* plane = nullptr;  // that it continues
-  std::vector<size_t> neighbours;    // rows
-  Matrix3f spread;                   // of its neighbours' means around it
+  const SeenPlane* plane = nullptr;        // that it continues
+  std::vector<size_t> neighbours;          // rows
+  Vector3f difference = Vector3f::Zero();  // of the discs around it, in colour
+  float pull = 0;                          // of that difference; 0 where no disc is near
+  Matrix3f spread = Matrix3f::Zero();      // of its neighbours' means around it
 };
 
 // Of the decoded voxels what no view saw.
@@ -274,10 +294,9 @@ std::vector<Voxel> unseenVoxels(const Gaussians& decoded, const Provenance& prov
   std::vector<uint8_t> is_left(all.size());
   tbb::parallel_for(size_t(0), all.size(), [&](size_t v) {
     const size_t begin = v * size_t(per_voxel);
-    all[v].generated = provenance.generated[begin];
     std::vector<Blob> parts;
     for (size_t i = begin; i < begin + size_t(per_voxel); ++i) {
-      if (!all[v].generated && bounds.sees(decoded.mean[i], s.voxel_m)) continue;
+      if (!provenance.generated[i] && bounds.sees(decoded.mean[i], s.voxel_m)) continue;
       parts.push_back(blobOf(decoded, i));
       parts.back().probability = provenance.probability[i];
     }
@@ -339,22 +358,24 @@ const SeenPlane* planeAt(const Voxel& v, const std::vector<SeenPlane>& planes,
   return nearest;
 }
 
-// How the discs around a voxel differ from it in colour; those of its plane, where it continues
-// one.
-Vector3f differenceAtRim(const Gaussians& discs, const PointCells& disc_cells, float voxel_m,
-                         Voxel* v) {
+// How the discs around a voxel differ from it in colour (those of its plane, where it continues
+// one), and how much that tells of its own. A large difference is that of another thing.
+void lookAtRim(const Gaussians& discs, const PointCells& disc_cells, float voxel_m, Voxel* v) {
   const float sigma = kRimSigma * voxel_m;
   Vector3f sum = Vector3f::Zero();
-  float mass = 0;
+  float covered = 0;  // m^2
   disc_cells.near(v->blob.mean, [&](size_t d, float squared) {
     if (v->plane && std::abs(v->plane->distance(discs.mean[d])) > kPlaneSlack) return;
     const Vector3f sigmas = discs.log_scale[d].array().exp();
     const float area = sigmas.prod() / sigmas.minCoeff();
     const float w = area * std::exp(-squared / (2 * sigma * sigma));
-    mass += w, sum += w * (Eigen::Map<const Vector3f>(&discs.sh[3 * d]) - v->blob.colour);
+    covered += w, sum += w * (Eigen::Map<const Vector3f>(&discs.sh[3 * d]) - v->blob.colour);
   });
-  v->meets_discs = mass > 0;
-  return v->meets_discs ? Vector3f(sum / mass) : Vector3f::Zero();
+  if (covered <= 0) return;
+  v->difference = sum / covered;
+  const float other = kSh0 * v->difference.norm() / kOtherThing;
+  v->pull = kRimPull * std::min(1.f, covered / (kCovered * voxel_m * voxel_m)) *
+            std::exp(-other * other / 2);
 }
 
 // Fits the colours of what was generated to those of the discs where both meet, and carries the
@@ -362,17 +383,15 @@ Vector3f differenceAtRim(const Gaussians& discs, const PointCells& disc_cells, f
 void fitColours(const Gaussians& discs, const PointCells& disc_cells, float voxel_m,
                 std::vector<Voxel>* voxels) {
   const size_t n = voxels->size();
-  std::vector<Vector3f> at_rim(n), offset(n, Vector3f::Zero()), next(n);
-  tbb::parallel_for(size_t(0), n, [&](size_t i) {
-    at_rim[i] = differenceAtRim(discs, disc_cells, voxel_m, &(*voxels)[i]);
-  });
+  std::vector<Vector3f> offset(n, Vector3f::Zero()), next(n);
+  tbb::parallel_for(size_t(0), n,
+                    [&](size_t i) { lookAtRim(discs, disc_cells, voxel_m, &(*voxels)[i]); });
   for (int round = 0; round < kRounds; ++round) {
     tbb::parallel_for(size_t(0), n, [&](size_t i) {
       const Voxel& v = (*voxels)[i];
-      const float pull = v.meets_discs ? kRimPull : 0;
-      Vector3f sum = pull * at_rim[i];
+      Vector3f sum = v.pull * v.difference;
       for (size_t k : v.neighbours) sum += offset[k];
-      next[i] = sum / (pull + kLeak + float(v.neighbours.size()));
+      next[i] = sum / (v.pull + kLeak + float(v.neighbours.size()));
     });
     std::swap(offset, next);
   }
@@ -406,9 +425,9 @@ std::vector<Blob> visibleBlobs(const std::vector<Voxel>& voxels, const Bounds& b
   tbb::parallel_for(size_t(0), voxels.size(), [&](size_t i) {
     blobs[i] = drawn(voxels[i], voxel_m);
     // What a view saw there is a disc already.
-    if (voxels[i].generated && bounds.sees(blobs[i].mean, voxel_m)) return;
+    if (bounds.sees(blobs[i].mean, voxel_m)) return;
     if (!bounds.standsBefore(blobs[i]))
-      fates[i] = voxels[i].meets_discs ? kAlone : kMerged;
+      fates[i] = voxels[i].pull > 0 ? kAlone : kMerged;
     else if (bounds.clip(&blobs[i]))
       fates[i] = kAlone;
   });
