@@ -13,7 +13,8 @@ target_sources(vdbc_core PUBLIC FILE_SET HEADERS BASE_DIRS ${PROJECT_SOURCE_DIR}
 set(core_libraries vdbc_core)
 if(VDBC_NN)
   target_sources(vdbc_nn PUBLIC FILE_SET HEADERS BASE_DIRS ${PROJECT_SOURCE_DIR} FILES
-    encoder/config.h encoder/encoder.h encoder/observation.h encoder/positions.h mar/completer.h mar/config.h)
+    encoder/config.h encoder/encoder.h encoder/observation.h encoder/positions.h mar/calibration.h mar/completer.h
+    mar/config.h)
   target_sources(vdbc_tools PUBLIC FILE_SET HEADERS BASE_DIRS ${PROJECT_SOURCE_DIR} FILES
     houdini_style_tools/blas.h houdini_style_tools/checkpoint.h houdini_style_tools/complete.h
     houdini_style_tools/render.h)

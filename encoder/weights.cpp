@@ -17,12 +17,14 @@ const char* typeName(torch::ScalarType type) {
   switch (type) {
     case torch::kFloat32:
       return "F32";
+    case torch::kFloat16:
+      return "F16";
     case torch::kInt32:
       return "I32";
     case torch::kInt64:
       return "I64";
     default:
-      throw Error("writeTensors: only float32, int32 and int64 tensors can be stored");
+      throw Error("writeTensors: only float32, float16, int32 and int64 tensors can be stored");
   }
 }
 

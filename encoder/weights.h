@@ -8,7 +8,7 @@
 namespace vdbc {
 
 struct TensorFile {
-  std::map<std::string, Tensor> tensors;        // float32, int32 or int64
+  std::map<std::string, Tensor> tensors;        // float32, float16, int32 or int64
   std::map<std::string, std::string> metadata;  // the header's __metadata__
 };
 

@@ -41,6 +41,7 @@ std::string completionIdentity(const Completer& completer, const Place& start,
                                const CompleteSettings& s) {
   CompleteSettings same = s;
   json identity{{"completer", completer.hash()},
+                {"config", completer.config().toJson()},
                 {"start", hashOf(start)},
                 {"region", s.region ? hashOf(*s.region) : ""}};
   for (const Option& o : identityOptions(&same)) identity[o.name()] = o.text();

@@ -51,9 +51,9 @@ Place encodeScene(const std::vector<View>& views, const Encoder& encoder,
     progress.start("encode");
     Place place = encoder.encode(views, observation, progress);
     progress.end();
+    for (const View& view : views) place.cameras.push_back(view.camera);
     if (settings.detail.seconds > 0) {
       progress.start("detail");
-      for (const View& view : views) place.cameras.push_back(view.camera);
       place.detail = detailOf(views, place, settings, progress);
       progress.end();
     }

@@ -169,7 +169,7 @@ ordered_json summaryOf(const SceneInput& in, const Made& made) {
           {"detail_steps", detail ? detail->steps : 0},
           {"detail_seconds", detail ? detail->seconds : 0},
           {"detail_estimated_seconds", detail ? detail->estimated_seconds : 0},
-          {"detail_missing", !detail && !made.place.cameras.empty()},
+          {"detail_missing", in.views.empty() && !detail && !made.place.cameras.empty()},
           {"ply_step_m", plyStep(gaussians)}};
 }
 

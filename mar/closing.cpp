@@ -12,6 +12,8 @@
 namespace vdbc {
 namespace {
 
+constexpr int kClosedLevel = 1;  // tokens are nodes of 2^3 voxels
+
 using Traits = boost::adjacency_list_traits<boost::vecS, boost::vecS, boost::directedS>;
 using Edge = Traits::edge_descriptor;
 struct Pipe {
@@ -107,6 +109,30 @@ class OpenRegions {
   mutable std::vector<size_t> parent_;
 };
 
+// Whoever took a view had room to stand in.
+constexpr double kStandingRoom_m = .5;
+
+// Whether the middle of a node lies within kStandingRoom_m of a camera.
+class StandingRoom {
+ public:
+  explicit StandingRoom(const Place& place) : radius_(kStandingRoom_m / place.frame.voxel_m) {
+    for (const Camera& camera : place.cameras)
+      lenses_.push_back(place.frame.toIndex(camera.world_from_camera.translation()));
+  }
+  bool holds(const Coord& node) const {
+    const double side = 1 << kClosedLevel;
+    const Eigen::Vector3d middle =
+        (Eigen::Vector3d(node.x(), node.y(), node.z()).array() + .5) * side;
+    return std::any_of(lenses_.begin(), lenses_.end(), [&](const Eigen::Vector3d& lens) {
+      return (middle - lens).norm() <= radius_;
+    });
+  }
+
+ private:
+  double radius_;  // voxels
+  std::vector<Eigen::Vector3d> lenses_;
+};
+
 }  // namespace
 
 std::vector<int64_t> closingTokens(const SeenSpace& nodes, const std::vector<Coord>& occupied,
@@ -124,10 +150,12 @@ std::vector<int64_t> closingTokens(const SeenSpace& nodes, const std::vector<Coo
   std::sort(pipes.begin(), pipes.end(),
             [&](int64_t a, int64_t b) { return dropped.ijk[size_t(a)] < dropped.ijk[size_t(b)]; });
   int32_t vertices = 2;
+  const StandingRoom room(dropped);
   pipes.erase(std::remove_if(pipes.begin(), pipes.end(),
                              [&](int64_t row) {
                                const Coord& c = dropped.ijk[size_t(row)];
-                               if (!box.isInside(c) || !kinds.insert(c, vertices)) return true;
+                               if (!box.isInside(c) || room.holds(c)) return true;
+                               if (!kinds.insert(c, vertices)) return true;
                                vertices += 2;
                                return false;
                              }),

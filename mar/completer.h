@@ -16,7 +16,7 @@ struct CompleteSettings {
   float coarse_tau = .1f;  // the coarse stage's gate: high recall
   /// Dropped tokens above this probability are taken back where they close a hole (a minimum cut
   /// between what was seen empty and the border of the volume); 1: none.
-  float hole_tau = .1f;
+  float hole_tau = 1;
   Neighbours neighbours = Neighbours::kCorners26;
   int sampling_steps = 0;  // DDIM steps of the diffusion head; 0: its linear mean
   double temperature = 1;

@@ -3,6 +3,7 @@
 #include <string>
 
 #include "encoder/positions.h"
+#include "mar/calibration.h"
 
 namespace vdbc {
 
@@ -24,6 +25,7 @@ struct CompleterConfig {
   // What the fine stage sees around a chunk of targets, nearest first.
   int context_tokens = 384, empty_tokens = 64, chunk_tokens = 160;
   int coarse_empty_tokens = 256, coarse_chunk_tokens = 1024;
+  Calibration calibration;  // of the fine stage's probabilities
 
   // Loss.
   float focal_gamma = 0, focal_alpha = .5f;
@@ -60,7 +62,8 @@ struct CompleterConfig {
     visit("window_overlap_m", c.window_overlap_m), visit("context_tokens", c.context_tokens);
     visit("empty_tokens", c.empty_tokens), visit("chunk_tokens", c.chunk_tokens);
     visit("coarse_empty_tokens", c.coarse_empty_tokens);
-    visit("coarse_chunk_tokens", c.coarse_chunk_tokens), visit("focal_gamma", c.focal_gamma);
+    visit("coarse_chunk_tokens", c.coarse_chunk_tokens);
+    Calibration::fields(c.calibration, visit), visit("focal_gamma", c.focal_gamma);
     visit("focal_alpha", c.focal_alpha), visit("unobserved_weight", c.unobserved_weight);
     visit("diffusion_weight", c.diffusion_weight);
     visit("refinement_weight", c.refinement_weight), visit("frontier_share", c.frontier_share);

@@ -53,13 +53,14 @@ Place predict(CompleterNet& net, const GrowthScene& scene, const Growth& g, cons
   for (size_t kind : {size_t(kCondition), size_t(kVisible)})
     in.tokens[kind].features = rowsOf(g.z, in.rows[kind]);
   const CompleterNet::Fine f = net.fine(in.tokens, scene.windows.window(chunk.window).frame);
-  const Tensor p = f.logits.sigmoid().contiguous();
+  const Tensor logits = f.logits.contiguous();
   const Tensor z = net.diffusion->sample(f.targets, s.sampling_steps, s.temperature, random);
   Place made;
   made.dim = net.config.latent_dim;
   made.ijk = chunk.tokens;
   made.z = asFiled(net, s.generated_context ? net.project(z) : z);
-  made.probability.assign(p.data_ptr<float>(), p.data_ptr<float>() + p.numel());
+  for (int64_t i = 0; i < logits.numel(); ++i)
+    made.probability.push_back(calibrated(net.config.calibration, logits.data_ptr<float>()[i]));
   made.bfs_level.assign(chunk.tokens.size(), level);
   made.generated.assign(chunk.tokens.size(), 1);
   return made;

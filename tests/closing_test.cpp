@@ -347,6 +347,27 @@ TEST(ClosingTokens, OnlyUnobservedTokensOfTheVolumeCanClose) {
   EXPECT_EQ(closed(scene, 0), std::set<Coord>{Coord(2, 2, 1)});
 }
 
+TEST(ClosingTokens, NothingClosesWherePeopleStand) {
+  // A corridor along x that ends in the open, seen in its middle: doors at its end and, likelier,
+  // behind the camera.
+  SeenSpace nodes;
+  nodes.level = 1, nodes.box = CoordBBox(Coord(0), Coord(12, 4, 4));
+  std::vector<Coord> walls;
+  for (const Coord& c : nodesOf(CoordBBox(Coord(1, 1, 1), Coord(12, 3, 3))))
+    if (c.x() == 1 || c.y() != 2 || c.z() != 2) walls.push_back(c);
+  nodes.empty.setValueOn(Coord(2, 2, 2));
+  Place dropped;
+  dropped.frame.voxel_m = .1f;  // nodes of .2 m
+  dropped.ijk = {Coord(4, 2, 2), Coord(8, 2, 2)};
+  dropped.probability = {.9f, .3f};
+  dropped.bfs_level.assign(2, 1), dropped.generated.assign(2, 1);
+  EXPECT_EQ(closingTokens(nodes, walls, dropped, 0), std::vector<int64_t>{0});
+  Camera camera;
+  camera.world_from_camera.translation() = dropped.frame.toWorld({5, 5, 5});  // .4 m away
+  dropped.cameras.push_back(camera);
+  EXPECT_EQ(closingTokens(nodes, walls, dropped, 0), std::vector<int64_t>{1});
+}
+
 TEST(ClosingTokens, TimeFollowsTheTokensAndNotTheVolume) {
   // A room in the middle of 10^15 nodes, and a thing far away.
   SeenSpace nodes;

@@ -183,7 +183,13 @@ TEST(Evaluate, ReliabilityCountsGeneratedNodes) {
   };
   add(0, 1, false), add(1, .25f, true), add(2, .25f, true), add(3, .75f, true), add(4, 1, true),
       add(5, 0, true);
-  const Reliability r = reliabilityOf(place, {{0, 0, 0}, {1, 0, 0}, {4, 0, 0}});
+  add(6, .9f, true);
+  SeenSpace all;
+  all.level = 1, all.box = CoordBBox(Coord(0), Coord(9));
+  for (int x : {0, 1, 4}) all.filled.setValueOn(Coord(x, 0, 0));
+  for (int x : {2, 3, 5}) all.empty.setValueOn(Coord(x, 0, 0));  // nobody saw the last one
+  Reliability r{};
+  for (const Outcome& o : outcomesOf(place, all)) vdbc::add(o, &r);
   const std::array<int, 10> counts = {1, 0, 2, 0, 0, 0, 0, 1, 0, 1},
                             hits = {0, 0, 1, 0, 0, 0, 0, 0, 0, 1};
   for (size_t i = 0; i < r.size(); ++i) {

@@ -161,7 +161,7 @@ openvdb::MetaMap metadataOf(const Place& g) {
   for (int row = 0; row < 4; ++row)
     for (int col = 0; col < 4; ++col) frame[row][col] = g.frame.world_from_grid.matrix()(col, row);
   metadata.insertMeta(kFrame, openvdb::Mat4DMetadata(frame));
-  for (size_t i = 0; i < g.cameras.size(); ++i)
+  for (size_t i = 0; g.detail && i < g.cameras.size(); ++i)
     metadata.insertMeta(joinText(kCamera, i), openvdb::StringMetadata(textOf(g.cameras[i])));
   const auto observed = std::count(g.generated.begin(), g.generated.end(), uint8_t(0));
   metadata.insertMeta("observed_count", openvdb::Int64Metadata(int64_t(observed)));

@@ -19,10 +19,10 @@ struct Place {
       seen;                  // F and E of the views, voxels; never null in a finished place
   std::string encoder_hash;  // of the weights that made the latents, Encoder::hash()
   std::string growth;        // of a completion that was cut short: where it goes on; else empty
-  /// What the views saw at the resolution of their pixels, from the grid's origin (splat/detail.h),
-  /// and the views' cameras; null and none where it was not asked for. Files of latents hold the
-  /// cameras alone.
+  /// What the views saw at the resolution of their pixels, from the grid's origin (splat/detail.h);
+  /// null where it was not asked for, and in files of latents.
   std::shared_ptr<const Detail> detail;
+  /// The views' cameras. Files of latents hold them where there is detail, which needs them.
   std::vector<Camera> cameras;
   int level = 1;
   int dim = 0;                     // latent channels

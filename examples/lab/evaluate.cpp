@@ -170,13 +170,6 @@ Eigen::Vector3f meanPixel(const std::vector<View>& views) {
   return (sum / std::max(1., count)).cast<float>();
 }
 
-std::vector<DepthView> allDepths(const EvaluationScene& scene) {
-  std::vector<DepthView> depths;
-  for (const std::vector<View>* views : {&scene.input, &scene.targets})
-    for (const View& v : *views) depths.push_back(v.depthView());
-  return depths;
-}
-
 // What all methods are held to in a scene.
 struct Truths {
   const SeenSpace& seen;   // of the input views, voxels
@@ -188,7 +181,7 @@ struct Truths {
   Truths(const EvaluationScene& scene, const VoxelFrame& frame, const SeenSpace& input,
          const CarveSettings& carving, Progress& progress)
       : seen(input),
-        all(carve(frame, allDepths(scene), carving, progress)),
+        all(seenByAll(scene, frame, carving, progress)),
         ground(meanPixel(scene.input)) {
     StateLookup states(input);
     for (const View& v : scene.targets) {
@@ -390,15 +383,28 @@ int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame,
   });
 }
 
-Reliability reliabilityOf(const Place& place, const std::set<Coord>& truth) {
-  Reliability bins;
+void add(const Outcome& outcome, Reliability* bins) {
+  const double p = outcome.probability;
+  ReliabilityBin& bin = (*bins)[std::min(bins->size() - 1, size_t(p * double(bins->size())))];
+  ++bin.count, bin.sum_probability += p, bin.hits += outcome.occupied;
+}
+
+SeenSpace seenByAll(const EvaluationScene& scene, const VoxelFrame& frame,
+                    const CarveSettings& carving, Progress& progress) {
+  std::vector<DepthView> depths;
+  for (const std::vector<View>* views : {&scene.input, &scene.targets})
+    for (const View& v : *views) depths.push_back(v.depthView());
+  return carve(frame, depths, carving, progress);
+}
+
+std::vector<Outcome> outcomesOf(const Place& place, const SeenSpace& all) {
+  std::vector<Outcome> outcomes;
   for (size_t i = 0; i < place.ijk.size(); ++i) {
-    if (!place.generated[i]) continue;
-    const double p = place.probability[i];
-    ReliabilityBin& bin = bins[std::min(bins.size() - 1, size_t(p * double(bins.size())))];
-    ++bin.count, bin.sum_probability += p, bin.hits += int64_t(truth.count(place.ijk[i]));
+    const NodeState state = all.at(place.ijk[i]);
+    if (place.generated[i] && state != NodeState::kUnobserved)
+      outcomes.push_back({place.probability[i], state == NodeState::kFilled});
   }
-  return bins;
+  return outcomes;
 }
 
 double calibrationError(const Reliability& reliability) {
@@ -580,8 +586,10 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   add("completed", completed, completed_seconds);
   results.back().peak_rss_mb = completed_rss;
 
-  if (scene.truth) {
-    results.back().reliability = reliabilityOf(place, unseen.truth);
+  const std::vector<Outcome> outcomes = outcomesOf(place, poolSeen(truths.all, 1));
+  if (!outcomes.empty()) {
+    results.back().reliability.emplace();
+    for (const Outcome& o : outcomes) vdbc::add(o, &*results.back().reliability);
     results.back().ece = calibrationError(*results.back().reliability);
   }
   start = std::chrono::steady_clock::now();

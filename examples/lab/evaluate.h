@@ -53,15 +53,20 @@ SetScores setScores(const std::set<Coord>& filled, const std::set<Coord>& truth)
 int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame,
                      const std::set<Coord>& filled, const std::set<Coord>& truth);
 
-/// Generated nodes by their stored probability: bin i of ten holds [i, i + 1) / 10, the last one
-/// also 1.
+/// What the input and target views of a scene saw, voxels.
+SeenSpace seenByAll(const EvaluationScene& scene, const VoxelFrame& frame,
+                    const CarveSettings& carving, Progress& progress);
+/// What became of the generated tokens of `place`, by what `all` says of nodes of their level;
+/// those that nobody saw do not count.
+std::vector<Outcome> outcomesOf(const Place& place, const SeenSpace& all);
+
+/// Outcomes by their probability: bin i of ten holds [i, i + 1) / 10, the last one also 1.
 struct ReliabilityBin {
-  int64_t count = 0, hits = 0;  // hits: in the truth
+  int64_t count = 0, hits = 0;  // hits: occupied
   double sum_probability = 0;
 };
 using Reliability = std::array<ReliabilityBin, 10>;
-/// Of the generated tokens of `place`; `truth` are nodes of their level.
-Reliability reliabilityOf(const Place& place, const std::set<Coord>& truth);
+void add(const Outcome& outcome, Reliability* bins);
 /// Expected calibration error: mean over the nodes of |share of hits - mean probability| of their
 /// bin (Naeini et al. 2015). NaN without nodes.
 double calibrationError(const Reliability& reliability);

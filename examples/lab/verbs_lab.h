@@ -7,7 +7,8 @@ namespace vdbc {
 Verb evalVerb();          // verbs_lab.cpp
 Verb trainEncoderVerb();  // verbs_train.cpp
 Verb trainMarVerb();
-Verb tablesVerb();  // verbs_tables.cpp
+Verb calibrateVerb();  // verbs_calibrate.cpp
+Verb tablesVerb();     // verbs_tables.cpp
 Verb compareVerb();
 std::vector<Verb> makeRoomsVerbs();  // verbs_rooms.cpp
 

@@ -1,0 +1,60 @@
+// Completion adds to what views saw and does not spoil it: every input view, before and after.
+#include <gtest/gtest.h>
+
+#include "encoder/views/read_views.h"
+#include "houdini_style_tools/complete.h"
+#include "splat/metrics.h"
+#include "splat/rasterize.h"
+#include "tests/files.h"
+
+namespace vdbc {
+namespace {
+
+const std::string kWeights = VDBC_SOURCE_DIR "/weights/indoor";
+
+// Decibels of each view, the scene's Gaussians over black.
+std::vector<double> viewPsnr(const std::vector<View>& views, const Place& place,
+                             const Encoder& encoder, const SceneSettings& settings) {
+  Progress progress;
+  const Scene made = sceneOf(encoder.decode(place, settings.child_threshold, progress), place);
+  std::vector<double> result;
+  for (const View& v : views)
+    result.push_back(psnr(rasterize(made.splats.gaussians, v.camera, {}).colour, v.colour));
+  return result;
+}
+
+void expectNoInputIsWorse(const std::string& folder, const ReadViewsSettings& reading) {
+  if (folder.empty()) GTEST_SKIP() << "the capture is not on this machine";
+  if (!std::filesystem::exists(kWeights)) GTEST_SKIP() << "no trained weights in " << kWeights;
+  const std::vector<View> views = readViews(folder, reading);
+  const Encoder encoder(kWeights + "/encoder.safetensors");
+  const Completer completer(kWeights + "/completer.safetensors");
+  SceneSettings settings;
+  settings.observing.volume.up = conventionalUp(folder);
+  Progress progress;
+  const Place seen = encodeScene(views, encoder, settings, progress);
+  const Place completed = completer.complete(seen, settings.completion, progress);
+  ASSERT_GT(completed.size(), seen.size());
+  const std::vector<double> before = viewPsnr(views, seen, encoder, settings),
+                            after = viewPsnr(views, completed, encoder, settings);
+  for (size_t i = 0; i < views.size(); ++i) {
+    std::printf("view %zu: %.2f dB, completed %.2f\n", i, before[i], after[i]);
+    EXPECT_GT(after[i], before[i] - .2) << folder << ", view " << i;
+  }
+}
+
+TEST(Captures, NoBundledViewIsWorse) {
+  expectNoInputIsWorse(VDBC_SOURCE_DIR "/examples/two_views", {});
+}
+TEST(Captures, NoViewOfTheKitchenIsWorse) {
+  expectNoInputIsWorse(sharedFile("data/rgbd_redkitchen"), {{0, 6, 12, 18}});
+}
+TEST(Captures, NoViewOfTheDiningRoomIsWorse) {
+  expectNoInputIsWorse(sharedFile("data/rgbd_diningroom"), {{0, 2, 4}});
+}
+TEST(Captures, NoViewOfTheLivingRoomIsWorse) {
+  expectNoInputIsWorse(sharedFile("data/rgbd_livingroom_rendered"), {{0, 2, 4}});
+}
+
+}  // namespace
+}  // namespace vdbc
