@@ -1,13 +1,13 @@
 #include "vdb/fuse.h"
 
-#include <openvdb/tools/FastSweeping.h>
-#include <openvdb/tools/SignedFloodFill.h>
 #include <tbb/parallel_for.h>
 
 #include <algorithm>
 #include <cmath>
 
+#include "vdb/continuation.h"
 #include "vdb/error.h"
+#include "vdb/narrow_band.h"
 #include "vdb/vdb_file.h"
 
 namespace vdbc {
@@ -21,7 +21,11 @@ constexpr double kFinest = .01, kCoarsest = .05;  // metres
 constexpr int kCell = 4;                          // pixels over whose means slopes are taken
 constexpr double kSameSurface = .03;              // of 1/z: neighbours within are one surface
 constexpr double kLeastCosine = .1;
-constexpr float kShell = .67f;  // of the band: how thick at least what was measured is
+constexpr float kShell = .67f;          // of the band: how thick at least what was measured is
+constexpr float kHold = .5f, kEnd = 2;  // voxels that a measured surface goes on beyond its border
+constexpr double kLook = 1.5;           // voxels before it where it has to be open
+constexpr float kFill = .25f;           // voxels that it may go beyond the solid ones
+constexpr float kSmallest = .1f;        // metres: smaller parts that nobody measured are none
 
 // Round distances make small files, and those most whose last bits are 0.
 float stepOf(float band) {
@@ -346,76 +350,73 @@ int detailPartsOf(const VoxelFrame& frame, const openvdb::GridBase& fused) {
 
 namespace {
 
+// Free space is cut out; close behind what was measured there is something.
+float cutBack(float solid, float measured, float band) {
+  const float distance = std::max(solid, measured);
+  return measured < 0 ? std::min(distance, std::max(measured, -measured - kShell * band))
+                      : distance;
+}
+
+float smoothStep(float t) { return t <= 0 ? 0.f : t >= 1 ? 1.f : t * t * (3 - 2 * t); }
+
+// The boundary of the solid voxels lies up to a voxel before or behind the surface that is in them.
+// Beyond the borders of what was measured it is led there along the measured surface's planes.
+FloatTree distancesAtBorders(const FloatTree& measured, const SmoothSolid& smooth, int parts,
+                             float voxel_m) {
+  const float edge = voxel_m / float(parts), band = float(kDetailBand) * edge;
+  const std::vector<ContinuedVoxel> continued =
+      continueDistance(measured, edge, (parts + 1) / 2, kEnd * voxel_m);
+  std::vector<float> distances(continued.size());
+  tbb::parallel_for(size_t(0), continued.size(), [&](size_t i) {
+    SmoothSolid::Lookup solids(smooth);
+    const ContinuedVoxel& v = continued[i];
+    const Vector3d p = Vector3d(v.ijk.x() + .5, v.ijk.y() + .5, v.ijk.z() + .5) / parts,
+                   normal = v.normal.cast<double>(), foot = p - double(v.distance / voxel_m) * normal;
+    const float solid = solids.distance(p);
+    // Where voxels stand on the plane, what they are is not told from it.
+    const float open = .5f + solids.distance(foot + kLook * normal) / voxel_m;
+    // Where none is at the plane or before it, nothing goes on.
+    const float sheet = std::min(solids.distance(foot), solids.distance(foot + .5 * normal));
+    const float goes_on = std::max(cutBack(solid, v.distance, band),
+                                   std::min(solid, sheet - kFill * voxel_m));
+    const float weight =
+        open * smoothStep((kEnd - v.reach / voxel_m) / (kEnd - kHold));
+    distances[i] = solid + weight * (goes_on - solid);
+  });
+  FloatTree tree(band);
+  openvdb::tree::ValueAccessor<FloatTree, false> values(tree);
+  for (size_t i = 0; i < continued.size(); ++i) values.setValueOn(continued[i].ijk, distances[i]);
+  return tree;
+}
+
 // Distances of the right sign, right where they are near 0, in all voxels of a leaf.
 Leaf* surfaceLeaf(const Coord& origin, const SmoothSolid& smooth, int parts, float band,
-                  const Leaf* measured) {
+                  const Leaf* measured, const Leaf* at_border) {
   SmoothSolid::Lookup solids(smooth);
   auto* leaf = new Leaf(origin, band, true);
   for (openvdb::Index n = 0; n < Leaf::SIZE; ++n) {
-    const Coord ijk = leaf->offsetToGlobalCoord(n);
-    float distance = solids.distance(Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5) / parts);
-    if (measured && measured->isValueOn(n)) {
-      // Free space is cut out; close behind what was measured there is something.
-      const float f = measured->getValue(n);
-      distance = std::max(distance, f);
-      if (f < 0) distance = std::min(distance, std::max(f, -f - kShell * band));
+    if (at_border && at_border->isValueOn(n)) {
+      leaf->setValueOnly(n, at_border->getValue(n));
+      continue;
     }
-    leaf->setValueOnly(n, distance);
+    const Coord ijk = leaf->offsetToGlobalCoord(n);
+    const float solid =
+        solids.distance(Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5) / parts);
+    const bool is_measured = measured && measured->isValueOn(n);
+    leaf->setValueOnly(n, is_measured ? cutBack(solid, measured->getValue(n), band) : solid);
   }
   return leaf;
 }
 
-// Leaves only those voxels active that have the other sign within kDetailBand along the axes, one
-// axis after the other: more than the band needs, and no more than distances are looked for.
-void keepBand(FloatGrid* grid) {
-  constexpr int kReach = kDetailBand, kSide = int(Leaf::DIM) + 2 * kReach;
-  const FloatTree& tree = grid->constTree();
-  std::vector<Leaf*> leaves;
-  grid->tree().getNodes(leaves);
-  std::vector<openvdb::util::NodeMask<3>> masks(leaves.size());
-  tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {
-    const openvdb::tree::ValueAccessor<const FloatTree, false> values(tree);
-    // Bits: 1 something negative is near, 2 something positive.
-    std::array<uint8_t, kSide * kSide * kSide> near, swap;
-    size_t k = 0;
-    for (int x = -kReach; x < kSide - kReach; ++x)
-      for (int y = -kReach; y < kSide - kReach; ++y)
-        for (int z = -kReach; z < kSide - kReach; ++z)
-          near[k++] = values.getValue(leaves[i]->origin().offsetBy(x, y, z)) < 0 ? 1 : 2;
-    for (int step : {1, kSide, kSide * kSide}) {
-      for (int at = 0; at < int(near.size()); ++at) {
-        uint8_t bits = near[size_t(at)];
-        for (int d = 1; d <= kReach; ++d) {
-          if (at - d * step >= 0) bits |= near[size_t(at - d * step)];
-          if (at + d * step < int(near.size())) bits |= near[size_t(at + d * step)];
-        }
-        swap[size_t(at)] = bits;
-      }
-      std::swap(near, swap);
-    }
-    for (openvdb::Index n = 0; n < Leaf::SIZE; ++n) {
-      const Coord c = Leaf::offsetToLocalCoord(n).offsetBy(kReach);
-      if (near[size_t((c.x() * kSide + c.y()) * kSide + c.z())] == 3) masks[i].setOn(n);
-    }
-  });
-  for (size_t i = 0; i < leaves.size(); ++i) leaves[i]->setValueMask(masks[i]);
-}
-
 // Only the band stays active; what is beyond has its sign.
-void trimBand(float band, FloatGrid* grid) {
-  const float step = stepOf(band);
+void roundDistances(FloatGrid* grid) {
+  const float band = grid->background(), step = stepOf(band);
   std::vector<Leaf*> leaves;
   grid->tree().getNodes(leaves);
   tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {
-    for (openvdb::Index n = 0; n < Leaf::SIZE; ++n) {
-      const float d = leaves[i]->getValue(n);
-      if (leaves[i]->isValueOn(n) && std::abs(d) < band)
-        leaves[i]->setValueOnly(n, roundedTo(step, d));
-      else
-        leaves[i]->setValueOff(n, d < 0 ? -band : band);
-    }
+    for (auto value = leaves[i]->beginValueOn(); value; ++value)
+      value.setValue(roundedTo(step, *value));
   });
-  openvdb::tools::signedFloodFill(grid->tree());
 }
 
 }  // namespace
@@ -426,16 +427,19 @@ FloatGrid::Ptr closedSurface(const VoxelFrame& frame, const std::vector<Coord>& 
   const VoxelFrame detail = detailFrame(frame, parts);
   const float band = float(kDetailBand) * detail.voxel_m;
   const SmoothSolid smooth(solid, double(frame.voxel_m));
+  const FloatTree& measured = fused.constTree();
+  const FloatTree at_borders = distancesAtBorders(measured, smooth, parts, frame.voxel_m);
   const std::vector<Coord> origins = leavesOver(solid, parts);
   std::vector<Leaf*> leaves(origins.size(), nullptr);
   tbb::parallel_for(size_t(0), origins.size(), [&](size_t i) {
-    leaves[i] =
-        surfaceLeaf(origins[i], smooth, parts, band, fused.constTree().probeConstLeaf(origins[i]));
+    leaves[i] = surfaceLeaf(origins[i], smooth, parts, band, measured.probeConstLeaf(origins[i]),
+                            at_borders.probeConstLeaf(origins[i]));
   });
   FloatGrid::Ptr grid = gridOf(leaves, detail);
-  keepBand(grid.get());
-  grid = openvdb::tools::sdfToSdf(*grid);
-  trimBand(band, grid.get());
+  const auto isMeasured = [&](const Coord& ijk) { return measured.getValue(ijk) < 0; };
+  dropSmallParts(int(std::lround(kSmallest / detail.voxel_m)), isMeasured, &grid->tree());
+  solveDistances(detail.voxel_m, kDetailBand, &grid->tree());
+  roundDistances(grid.get());
   grid->setGridClass(openvdb::GRID_LEVEL_SET);
   return grid;
 }
