@@ -5,6 +5,7 @@
 #include <Eigen/Dense>
 #include <array>
 #include <cmath>
+#include <limits>
 
 #include "vdb/token_map.h"
 
@@ -23,6 +24,9 @@ constexpr int kLeastSamples = 12;
 struct Plane {
   float distance = 0;                  // of the voxel's centre, in voxels
   Vector3f normal = Vector3f::Zero();  // 0: the surface ends here
+  float reach = 0;                     // voxels from the border, along the surface
+
+  bool ends() const { return normal.isZero(); }
 };
 
 bool isBorder(Values* measured, const Coord& ijk) {
@@ -63,7 +67,7 @@ TokenMap<Plane> bordersOf(const FloatTree& measured, float voxel, int plane_voxe
     for (auto value = leaves[i]->cbeginValueOn(); value; ++value) {
       const Coord ijk = value.getCoord();
       if (std::abs(*value) > near || !isBorder(&values, ijk)) continue;
-      found[i].push_back({ijk, {*value / voxel, fittedNormal(&values, ijk, plane_voxels)}});
+      found[i].push_back({ijk, {*value / voxel, fittedNormal(&values, ijk, plane_voxels), 0}});
     }
   });
   TokenMap<Plane> planes;
@@ -72,62 +76,72 @@ TokenMap<Plane> bordersOf(const FloatTree& measured, float voxel, int plane_voxe
   return planes;
 }
 
-Plane meanPlane(const TokenMap<Plane>& planes, const Coord& ijk, float half_width) {
+// Of the planes beside a voxel that were there before it.
+Plane meanPlane(const TokenMap<Plane>& planes, const Coord& ijk) {
   Plane mean;
+  mean.reach = std::numeric_limits<float>::max();
   int n = 0;
   for (const Coord& step : kBeside) {
     const Plane* from = planes.find(ijk + step);
-    if (!from || from->normal.isZero()) continue;
-    mean.distance += from->distance -
-                     from->normal.dot(Vector3f(float(step.x()), float(step.y()), float(step.z())));
+    if (!from || from->ends()) continue;
+    const float rise =
+        -from->normal.dot(Vector3f(float(step.x()), float(step.y()), float(step.z())));
+    mean.distance += from->distance + rise;
     mean.normal += from->normal;
+    mean.reach = std::min(mean.reach, from->reach + std::sqrt(std::max(0.f, 1 - rise * rise)));
     ++n;
   }
   mean.distance /= float(n);
-  if (std::abs(mean.distance) < half_width && !mean.normal.isZero())
-    mean.normal.normalize();
-  else
-    mean.normal.setZero();
+  if (!mean.ends()) mean.normal.normalize();
   return mean;
 }
 
 // The voxels beside the planes from row `begin` on that are neither measured nor among them.
-TokenMap<Plane> nextLayer(const FloatTree& measured, const TokenMap<Plane>& planes, size_t begin,
-                          float half_width) {
+TokenMap<Plane> nextLayer(const FloatTree& measured, const TokenMap<Plane>& planes, size_t begin) {
   const Values known(measured);
   TokenMap<size_t> beside;
   for (size_t i = begin; i < planes.size(); ++i) {
-    if (planes.values()[i].normal.isZero()) continue;
+    if (planes.values()[i].ends()) continue;
     for (const Coord& step : kBeside) {
       const Coord ijk = planes.tokens()[i] + step;
       if (!known.isValueOn(ijk) && !planes.find(ijk)) beside.insert(ijk, beside.size());
     }
   }
   std::vector<Plane> carried(beside.size());
-  tbb::parallel_for(size_t(0), carried.size(), [&](size_t i) {
-    carried[i] = meanPlane(planes, beside.tokens()[i], half_width);
-  });
+  tbb::parallel_for(size_t(0), carried.size(),
+                    [&](size_t i) { carried[i] = meanPlane(planes, beside.tokens()[i]); });
   return {beside.tokens(), std::move(carried)};
 }
 
 }  // namespace
 
 std::vector<ContinuedVoxel> continueDistance(const FloatTree& measured, float voxel,
-                                             int plane_voxels, float reach) {
+                                             const ContinuationSettings& s) {
   std::vector<ContinuedVoxel> continued;
-  const float half_width = measured.background() / voxel;
-  TokenMap<Plane> planes = bordersOf(measured, voxel, plane_voxels);
-  size_t begin = 0;
-  for (int layer = 1; float(layer) * voxel < reach; ++layer) {
-    const TokenMap<Plane> next = nextLayer(measured, planes, begin, half_width);
+  TokenMap<Plane> planes = bordersOf(measured, voxel, s.plane_voxels);
+  for (size_t begin = 0; begin < planes.size();) {
+    const TokenMap<Plane> next = nextLayer(measured, planes, begin);
     begin = planes.size();
     for (size_t i = 0; i < next.size(); ++i) {
-      const Plane& p = next.values()[i];
-      planes.insert(next.tokens()[i], p);
-      if (!p.normal.isZero())
-        continued.push_back({next.tokens()[i], p.distance * voxel, p.normal, float(layer) * voxel});
+      Plane plane = next.values()[i];
+      const float distance = plane.distance * voxel, reach = plane.reach * voxel;
+      if (distance <= -s.behind || distance >= s.before || reach >= s.reach) plane.normal.setZero();
+      planes.insert(next.tokens()[i], plane);
+      if (!plane.ends()) continued.push_back({next.tokens()[i], distance, plane.normal, reach});
     }
   }
+  // All that is above a place of the surface is as far from the border as that.
+  tbb::parallel_for(size_t(0), continued.size(), [&](size_t i) {
+    ContinuedVoxel& v = continued[i];
+    const Vector3f foot = v.distance / voxel * v.normal;
+    const Coord at = v.ijk.offsetBy(-int(std::lround(foot.x())), -int(std::lround(foot.y())),
+                                    -int(std::lround(foot.z())));
+    const Plane* plane = planes.find(at);
+    if (plane)
+      v.reach = plane->reach * voxel;
+    else if (measured.isValueOn(at))
+      v.reach = 0;
+  });
   return continued;
 }
 

@@ -1,5 +1,6 @@
 #include "vdb/fuse.h"
 
+#include <openvdb/Metadata.h>
 #include <tbb/parallel_for.h>
 
 #include <algorithm>
@@ -21,11 +22,11 @@ constexpr double kFinest = .01, kCoarsest = .05;  // metres
 constexpr int kCell = 4;                          // pixels over whose means slopes are taken
 constexpr double kSameSurface = .03;              // of 1/z: neighbours within are one surface
 constexpr double kLeastCosine = .1;
-constexpr float kShell = .67f;          // of the band: how thick at least what was measured is
-constexpr float kHold = .5f, kEnd = 2;  // voxels that a measured surface goes on beyond its border
-constexpr double kLook = 1.5;           // voxels before it where it has to be open
-constexpr float kFill = .25f;           // voxels that it may go beyond the solid ones
-constexpr float kSmallest = .1f;        // metres: smaller parts that nobody measured are none
+constexpr float kHold = .5f,
+                kEnd = 2.5f;      // voxels that a measured surface goes on beyond its border
+constexpr double kLook = 1.5;     // voxels before it where it has to be open
+constexpr float kFill = .25f;     // voxels that it may go beyond the solid ones
+constexpr float kSmallest = .1f;  // metres: smaller parts that nobody measured are none
 
 // Round distances make small files, and those most whose last bits are 0.
 float stepOf(float band) {
@@ -163,13 +164,12 @@ VoxelFrame detailFrame(const VoxelFrame& frame, int parts) {
   return detail;
 }
 
-// Leaves of the detail grid that touch the voxels, grown by a band; in order.
-std::vector<Coord> leavesOver(const std::vector<Coord>& voxels, int parts) {
+// Leaves of the detail grid that touch the voxels, grown by so many detail voxels; in order.
+std::vector<Coord> leavesOver(const std::vector<Coord>& voxels, int parts, int grown) {
   std::vector<Coord> origins;
   for (const Coord& ijk : voxels) {
-    const Coord low(ijk.x() * parts - kDetailBand, ijk.y() * parts - kDetailBand,
-                    ijk.z() * parts - kDetailBand);
-    const Coord high = low.offsetBy(parts - 1 + 2 * kDetailBand);
+    const Coord low(ijk.x() * parts - grown, ijk.y() * parts - grown, ijk.z() * parts - grown);
+    const Coord high = low.offsetBy(parts - 1 + 2 * grown);
     const int mask = ~int(Leaf::DIM - 1), step = int(Leaf::DIM);
     for (int x = low.x() & mask; x <= high.x(); x += step)
       for (int y = low.y() & mask; y <= high.y(); y += step)
@@ -332,7 +332,7 @@ FloatGrid::Ptr fuseDepth(const VoxelFrame& frame, const SeenSpace& seen,
                     [&](size_t i) { fuse_views[i] = fuseView(views[i], frame, settings.carving); });
   const int parts = partsOf(frame, fuse_views, settings.voxel_m);
   const VoxelFrame detail = detailFrame(frame, parts);
-  const std::vector<Coord> origins = leavesOver(filledNodes(seen), parts);
+  const std::vector<Coord> origins = leavesOver(filledNodes(seen), parts, kDetailBand);
   std::vector<Leaf*> leaves(origins.size(), nullptr);
   tbb::parallel_for(size_t(0), origins.size(),
                     [&](size_t i) { leaves[i] = fuseLeaf(detail, origins[i], fuse_views); });
@@ -350,40 +350,62 @@ int detailPartsOf(const VoxelFrame& frame, const openvdb::GridBase& fused) {
 
 namespace {
 
-// Free space is cut out; close behind what was measured there is something.
+// Free space is cut out. Behind what was measured there is something, as far as the views can tell:
+// it begins at a distance of 0 and ends where they tell no more.
 float cutBack(float solid, float measured, float band) {
-  const float distance = std::max(solid, measured);
-  return measured < 0 ? std::min(distance, std::max(measured, -measured - kShell * band))
-                      : distance;
+  if (measured > 0) return std::max(solid, measured);
+  const float begins = std::min(measured, -1e-3f * band), ends = -band - begins;
+  return std::clamp(solid, begins, std::max(begins, ends));
 }
 
 float smoothStep(float t) { return t <= 0 ? 0.f : t >= 1 ? 1.f : t * t * (3 - 2 * t); }
 
+// How far before a plane (behind: negative) the boundary of the solid voxels lies, in voxels, on
+// the way from `kLook` before it; 0 where there is none.
+double boundaryBefore(const Vector3d& foot, const Vector3d& normal, SmoothSolid::Lookup* solids) {
+  const auto at = [&](double s) { return double(solids->distance(foot + s * normal)); };
+  double inside = .5, outside = kLook;
+  while (inside >= -1 && at(inside) >= 0) outside = inside, inside -= .5;
+  if (inside < -1) return 0;
+  for (int k = 0; k < 4; ++k) {
+    const double middle = (inside + outside) / 2;
+    (at(middle) < 0 ? inside : outside) = middle;
+  }
+  return (inside + outside) / 2;
+}
+
 // The boundary of the solid voxels lies up to a voxel before or behind the surface that is in them.
-// Beyond the borders of what was measured it is led there along the measured surface's planes.
+// Beyond the borders of what was measured a slope leads to it from the measured surface's plane.
+float distanceAtBorder(const ContinuedVoxel& v, const SmoothSolid& smooth, int parts,
+                       float voxel_m) {
+  SmoothSolid::Lookup solids(smooth);
+  const float band = float(kDetailBand) * voxel_m / float(parts);
+  const Vector3d p = Vector3d(v.ijk.x() + .5, v.ijk.y() + .5, v.ijk.z() + .5) / parts,
+                 normal = v.normal.cast<double>(), foot = p - double(v.distance / voxel_m) * normal;
+  const float solid = solids.distance(p);
+  const float weight = smoothStep((kEnd - v.reach / voxel_m) / (kEnd - kHold));
+  const float slope = (1 - weight) * float(boundaryBefore(foot, normal, &solids)) * voxel_m;
+  // Where no voxel is at the plane or before it, nothing goes on.
+  const float sheet = std::min(solids.distance(foot), solids.distance(foot + .5 * normal));
+  const float goes_on =
+      std::max(cutBack(solid, v.distance - slope, band), std::min(solid, sheet - kFill * voxel_m));
+  // Where voxels stand on the plane, what they are is not told from it.
+  const float open = .5f + solids.distance(foot + kLook * normal) / voxel_m;
+  return solid + open * std::min(1.f, 2 * weight) * (goes_on - solid);
+}
+
 FloatTree distancesAtBorders(const FloatTree& measured, const SmoothSolid& smooth, int parts,
                              float voxel_m) {
-  const float edge = voxel_m / float(parts), band = float(kDetailBand) * edge;
+  ContinuationSettings s;
+  s.plane_voxels = (parts + 1) / 2;
+  s.reach = kEnd * voxel_m, s.before = float(kLook) * voxel_m, s.behind = measured.background();
   const std::vector<ContinuedVoxel> continued =
-      continueDistance(measured, edge, (parts + 1) / 2, kEnd * voxel_m);
+      continueDistance(measured, voxel_m / float(parts), s);
   std::vector<float> distances(continued.size());
   tbb::parallel_for(size_t(0), continued.size(), [&](size_t i) {
-    SmoothSolid::Lookup solids(smooth);
-    const ContinuedVoxel& v = continued[i];
-    const Vector3d p = Vector3d(v.ijk.x() + .5, v.ijk.y() + .5, v.ijk.z() + .5) / parts,
-                   normal = v.normal.cast<double>(), foot = p - double(v.distance / voxel_m) * normal;
-    const float solid = solids.distance(p);
-    // Where voxels stand on the plane, what they are is not told from it.
-    const float open = .5f + solids.distance(foot + kLook * normal) / voxel_m;
-    // Where none is at the plane or before it, nothing goes on.
-    const float sheet = std::min(solids.distance(foot), solids.distance(foot + .5 * normal));
-    const float goes_on = std::max(cutBack(solid, v.distance, band),
-                                   std::min(solid, sheet - kFill * voxel_m));
-    const float weight =
-        open * smoothStep((kEnd - v.reach / voxel_m) / (kEnd - kHold));
-    distances[i] = solid + weight * (goes_on - solid);
+    distances[i] = distanceAtBorder(continued[i], smooth, parts, voxel_m);
   });
-  FloatTree tree(band);
+  FloatTree tree(measured.background());
   openvdb::tree::ValueAccessor<FloatTree, false> values(tree);
   for (size_t i = 0; i < continued.size(); ++i) values.setValueOn(continued[i].ijk, distances[i]);
   return tree;
@@ -400,8 +422,7 @@ Leaf* surfaceLeaf(const Coord& origin, const SmoothSolid& smooth, int parts, flo
       continue;
     }
     const Coord ijk = leaf->offsetToGlobalCoord(n);
-    const float solid =
-        solids.distance(Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5) / parts);
+    const float solid = solids.distance(Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5) / parts);
     const bool is_measured = measured && measured->isValueOn(n);
     leaf->setValueOnly(n, is_measured ? cutBack(solid, measured->getValue(n), band) : solid);
   }
@@ -429,7 +450,8 @@ FloatGrid::Ptr closedSurface(const VoxelFrame& frame, const std::vector<Coord>& 
   const SmoothSolid smooth(solid, double(frame.voxel_m));
   const FloatTree& measured = fused.constTree();
   const FloatTree at_borders = distancesAtBorders(measured, smooth, parts, frame.voxel_m);
-  const std::vector<Coord> origins = leavesOver(solid, parts);
+  // What was measured may go on a band behind the voxels, and distances are asked for beyond.
+  const std::vector<Coord> origins = leavesOver(solid, parts, 2 * kDetailBand);
   std::vector<Leaf*> leaves(origins.size(), nullptr);
   tbb::parallel_for(size_t(0), origins.size(), [&](size_t i) {
     leaves[i] = surfaceLeaf(origins[i], smooth, parts, band, measured.probeConstLeaf(origins[i]),
@@ -437,9 +459,12 @@ FloatGrid::Ptr closedSurface(const VoxelFrame& frame, const std::vector<Coord>& 
   });
   FloatGrid::Ptr grid = gridOf(leaves, detail);
   const auto isMeasured = [&](const Coord& ijk) { return measured.getValue(ijk) < 0; };
-  dropSmallParts(int(std::lround(kSmallest / detail.voxel_m)), isMeasured, &grid->tree());
+  const int64_t dropped =
+      dropSmallParts(int(std::lround(kSmallest / detail.voxel_m)), isMeasured, &grid->tree());
+  grid->insertMeta("dropped_parts", openvdb::Int64Metadata(dropped));
   solveDistances(detail.voxel_m, kDetailBand, &grid->tree());
   roundDistances(grid.get());
+  grid->tree().prune();
   grid->setGridClass(openvdb::GRID_LEVEL_SET);
   return grid;
 }

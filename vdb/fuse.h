@@ -32,7 +32,10 @@ FloatGrid::Ptr fuseDepth(const VoxelFrame& frame, const SeenSpace& seen,
 int detailPartsOf(const VoxelFrame& frame, const openvdb::GridBase& fused);
 
 /// One closed level set: the boundary of the solid voxels, smoothed, cut back to what was measured
-/// where the views saw it. In the grid of `fused`, half width kDetailBand.
+/// where the views saw it and led there where they did not, over two voxels beyond the borders. In
+/// the grid of `fused`, half width kDetailBand. Parts smaller than .1 m along all axes of which
+/// nothing was measured are left out; the grid's metadata `dropped_parts` is how many. Parallel;
+/// the same values for any number of threads.
 FloatGrid::Ptr closedSurface(const VoxelFrame& frame, const std::vector<Coord>& solid,
                              const FloatGrid& fused);
 
