@@ -56,8 +56,27 @@ Vector3f fittedNormal(Values* measured, const Coord& ijk, int half_width) {
   return length > 0 && std::isfinite(length) ? Vector3f(slope / length) : Vector3f::Zero();
 }
 
+// By voxel; rows stay as voxels are added.
+class Planes {
+ public:
+  size_t size() const { return planes_.size(); }
+  const Coord& ijk(size_t row) const { return rows_.tokens()[row]; }
+  Plane& operator[](size_t row) { return planes_[row]; }
+  void add(const Coord& ijk, const Plane& plane) {
+    if (rows_.insert(ijk, planes_.size())) planes_.push_back(plane);
+  }
+  const Plane* find(const Coord& ijk) const {
+    const size_t* row = rows_.find(ijk);
+    return row ? &planes_[*row] : nullptr;
+  }
+
+ private:
+  TokenMap<size_t> rows_;
+  std::vector<Plane> planes_;
+};
+
 // The voxels at the border of what was measured, near the surface, in the tree's order.
-TokenMap<Plane> bordersOf(const FloatTree& measured, float voxel, int plane_voxels) {
+Planes bordersOf(const FloatTree& measured, float voxel, int plane_voxels) {
   std::vector<const Leaf*> leaves;
   measured.getNodes(leaves);
   std::vector<std::vector<std::pair<Coord, Plane>>> found(leaves.size());
@@ -70,14 +89,14 @@ TokenMap<Plane> bordersOf(const FloatTree& measured, float voxel, int plane_voxe
       found[i].push_back({ijk, {*value / voxel, fittedNormal(&values, ijk, plane_voxels), 0}});
     }
   });
-  TokenMap<Plane> planes;
+  Planes planes;
   for (const auto& some : found)
-    for (const auto& [ijk, plane] : some) planes.insert(ijk, plane);
+    for (const auto& [ijk, plane] : some) planes.add(ijk, plane);
   return planes;
 }
 
-// Of the planes beside a voxel that were there before it.
-Plane meanPlane(const TokenMap<Plane>& planes, const Coord& ijk) {
+// Of the planes beside a voxel that go on.
+Plane meanPlane(const Planes& planes, const Coord& ijk) {
   Plane mean;
   mean.reach = std::numeric_limits<float>::max();
   int n = 0;
@@ -96,21 +115,32 @@ Plane meanPlane(const TokenMap<Plane>& planes, const Coord& ijk) {
   return mean;
 }
 
-// The voxels beside the planes from row `begin` on that are neither measured nor among them.
-TokenMap<Plane> nextLayer(const FloatTree& measured, const TokenMap<Plane>& planes, size_t begin) {
-  const Values known(measured);
-  TokenMap<size_t> beside;
-  for (size_t i = begin; i < planes.size(); ++i) {
-    if (planes.values()[i].ends()) continue;
+// Adds the voxels beside those from row `begin` on that are neither measured nor there yet.
+void addLayer(const FloatTree& measured, size_t begin, Planes* planes) {
+  Values known(measured);
+  const size_t end = planes->size();
+  for (size_t i = begin; i < end; ++i) {
+    if ((*planes)[i].ends()) continue;
     for (const Coord& step : kBeside) {
-      const Coord ijk = planes.tokens()[i] + step;
-      if (!known.isValueOn(ijk) && !planes.find(ijk)) beside.insert(ijk, beside.size());
+      const Coord ijk = planes->ijk(i) + step;
+      if (!known.isValueOn(ijk)) planes->add(ijk, {});
     }
   }
-  std::vector<Plane> carried(beside.size());
+  std::vector<Plane> carried(planes->size() - end);
   tbb::parallel_for(size_t(0), carried.size(),
-                    [&](size_t i) { carried[i] = meanPlane(planes, beside.tokens()[i]); });
-  return {beside.tokens(), std::move(carried)};
+                    [&](size_t i) { carried[i] = meanPlane(*planes, planes->ijk(end + i)); });
+  for (size_t i = 0; i < carried.size(); ++i) (*planes)[end + i] = carried[i];
+}
+
+// All that is above a place of the surface is as far from the border as that.
+float reachOf(const ContinuedVoxel& v, const FloatTree& measured, const Planes& planes,
+              float voxel) {
+  const Vector3f off = v.distance / voxel * v.normal;
+  const Coord foot = v.ijk.offsetBy(-int(std::lround(off.x())), -int(std::lround(off.y())),
+                                    -int(std::lround(off.z())));
+  if (measured.isValueOn(foot)) return 0;
+  const Plane* plane = planes.find(foot);
+  return plane ? plane->reach * voxel : v.reach;
 }
 
 }  // namespace
@@ -118,29 +148,20 @@ TokenMap<Plane> nextLayer(const FloatTree& measured, const TokenMap<Plane>& plan
 std::vector<ContinuedVoxel> continueDistance(const FloatTree& measured, float voxel,
                                              const ContinuationSettings& s) {
   std::vector<ContinuedVoxel> continued;
-  TokenMap<Plane> planes = bordersOf(measured, voxel, s.plane_voxels);
+  Planes planes = bordersOf(measured, voxel, s.plane_voxels);
   for (size_t begin = 0; begin < planes.size();) {
-    const TokenMap<Plane> next = nextLayer(measured, planes, begin);
-    begin = planes.size();
-    for (size_t i = 0; i < next.size(); ++i) {
-      Plane plane = next.values()[i];
-      const float distance = plane.distance * voxel, reach = plane.reach * voxel;
-      if (distance <= -s.behind || distance >= s.before || reach >= s.reach) plane.normal.setZero();
-      planes.insert(next.tokens()[i], plane);
-      if (!plane.ends()) continued.push_back({next.tokens()[i], distance, plane.normal, reach});
+    const size_t end = planes.size();
+    addLayer(measured, begin, &planes);
+    for (size_t i = begin = end; i < planes.size(); ++i) {
+      const float distance = planes[i].distance * voxel, reach = planes[i].reach * voxel;
+      if (distance <= -s.behind || distance >= s.before || reach >= s.reach)
+        planes[i].normal.setZero();
+      else if (!planes[i].ends())
+        continued.push_back({planes.ijk(i), distance, planes[i].normal, reach});
     }
   }
-  // All that is above a place of the surface is as far from the border as that.
   tbb::parallel_for(size_t(0), continued.size(), [&](size_t i) {
-    ContinuedVoxel& v = continued[i];
-    const Vector3f foot = v.distance / voxel * v.normal;
-    const Coord at = v.ijk.offsetBy(-int(std::lround(foot.x())), -int(std::lround(foot.y())),
-                                    -int(std::lround(foot.z())));
-    const Plane* plane = planes.find(at);
-    if (plane)
-      v.reach = plane->reach * voxel;
-    else if (measured.isValueOn(at))
-      v.reach = 0;
+    continued[i].reach = reachOf(continued[i], measured, planes, voxel);
   });
   return continued;
 }

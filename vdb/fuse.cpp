@@ -4,6 +4,7 @@
 #include <tbb/parallel_for.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 
 #include "vdb/continuation.h"
@@ -303,19 +304,28 @@ class SmoothSolid {
     float distance(const Vector3d& p) {
       const Vector3d low = (p.array() - .5).floor();
       const Vector3d f = p.array() - .5 - low.array();
+      look(Coord(int(low.x()), int(low.y()), int(low.z())));
       double share = 0;
-      for (int k = 0; k < 8; ++k) {
-        const Coord c(int(low.x()) + (k & 1), int(low.y()) + (k >> 1 & 1), int(low.z()) + (k >> 2));
-        if (cells_.isValueOn(c))
+      for (size_t k = 0; k < 8; ++k)
+        if (solid_[k])
           share += (k & 1 ? f.x() : 1 - f.x()) * (k >> 1 & 1 ? f.y() : 1 - f.y()) *
                    (k >> 2 ? f.z() : 1 - f.z());
-      }
       return float((.5 - share) * voxel_m_);
     }
 
    private:
+    // Neighbouring places mostly lie between the same voxels.
+    void look(const Coord& low) {
+      if (low == low_) return;
+      low_ = low;
+      for (int k = 0; k < 8; ++k)
+        solid_[size_t(k)] = cells_.isValueOn(low.offsetBy(k & 1, k >> 1 & 1, k >> 2));
+    }
+
     openvdb::tree::ValueAccessor<const MaskTree, false> cells_;
     double voxel_m_;
+    Coord low_ = Coord::max();
+    std::array<bool, 8> solid_{};
   };
 
  private:
