@@ -11,6 +11,7 @@
 #include <map>
 #include <random>
 
+#include "encoder/views/read_views.h"
 #include "tests/expect_error.h"
 #include "tests/files.h"
 #include "vdb/scene_vdb.h"
@@ -315,6 +316,43 @@ TEST(Fuse, SmallPartsAreDroppedUnlessTheyWereMeasured) {
   EXPECT_TRUE(isSolid({6, 1, 1}));
   EXPECT_TRUE(isSolid({33, 1, 1}));
   EXPECT_EQ(surface->metaValue<int64_t>("dropped_parts"), 1);
+}
+
+// Noise and holes of a sensor, and cameras that do not quite agree.
+TEST(Fuse, TheSurfaceOfACaptureIsThatOfItsDepth) {
+  const std::string folder = sharedFile("data/rgbd_redkitchen");
+  if (folder.empty()) GTEST_SKIP() << "no kitchen";
+  ReadViewsSettings reading;
+  reading.frames = {0, 6, 12, 18};
+  Capture c;
+  for (const View& v : readViews(folder, reading))
+    c.cameras.push_back(v.camera), c.depths.push_back(v.depth);
+  VoxelFrame f;
+  const Vector3d middle = c.cameras[0].unproject(320, 240, 2) / .1;
+  const Coord centre(int(middle.x()), int(middle.y()), int(middle.z()));
+  f.bounds = CoordBBox(centre.offsetBy(-50), centre.offsetBy(50));
+  const FloatGrid::Ptr plain = fused(c, f, .025f);
+  const FloatGrid::Ptr surface = closedSurface(f, filledNodes(carved(c, f)), *plain);
+  openvdb::tools::GridSampler<FloatGrid, openvdb::tools::BoxSampler> of_surface(*surface),
+      of_plain(*plain);
+  double bias = 0, square = 0, plain_square = 0;
+  int n = 0, lost = 0;
+  for (const DepthView& view : c.views()) {
+    const std::vector<float> depth = usableDepth(view, {});
+    for (size_t i = 0; i < depth.size(); i += 7) {
+      if (!(depth[i] > 0)) continue;
+      const Vector3d p =
+          view.camera.unproject(double(i % 640) + .5, double(i / 640) + .5, double(depth[i]));
+      const openvdb::Vec3d at(p.x(), p.y(), p.z());
+      const double d = double(of_surface.wsSample(at));
+      bias += d, square += d * d, plain_square += std::pow(double(of_plain.wsSample(at)), 2), ++n;
+      lost += std::abs(d) > .999 * double(surface->background());
+    }
+  }
+  ASSERT_GT(n, 50000);
+  EXPECT_LT(std::abs(bias / n), .003);
+  EXPECT_LT(std::sqrt(square), 1.2 * std::sqrt(plain_square));
+  EXPECT_LT(lost, .001 * n);
 }
 
 TEST(Fuse, DistancesAreThoseOfAnEikonal) {
