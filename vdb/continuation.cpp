@@ -138,9 +138,8 @@ float reachOf(const ContinuedVoxel& v, const FloatTree& measured, const Planes& 
   const Vector3f off = v.distance / voxel * v.normal;
   const Coord foot = v.ijk.offsetBy(-int(std::lround(off.x())), -int(std::lround(off.y())),
                                     -int(std::lround(off.z())));
-  if (measured.isValueOn(foot)) return 0;
-  const Plane* plane = planes.find(foot);
-  return plane ? plane->reach * voxel : v.reach;
+  if (const Plane* plane = planes.find(foot)) return plane->reach * voxel;
+  return measured.isValueOn(foot) ? 0 : v.reach;
 }
 
 }  // namespace

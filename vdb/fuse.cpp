@@ -394,7 +394,9 @@ float distanceAtBorder(const ContinuedVoxel& v, const SmoothSolid& smooth, int p
                  normal = v.normal.cast<double>(), foot = p - double(v.distance / voxel_m) * normal;
   const float solid = solids.distance(p);
   const float weight = smoothStep((kEnd - v.reach / voxel_m) / (kEnd - kHold));
-  const float slope = (1 - weight) * float(boundaryBefore(foot, normal, &solids)) * voxel_m;
+  if (weight == 0) return solid;
+  const float slope =
+      weight == 1 ? 0 : (1 - weight) * float(boundaryBefore(foot, normal, &solids)) * voxel_m;
   // Where no voxel is at the plane or before it, nothing goes on.
   const float sheet = std::min(solids.distance(foot), solids.distance(foot + .5 * normal));
   const float goes_on =
