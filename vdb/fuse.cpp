@@ -23,10 +23,10 @@ constexpr double kFinest = .01, kCoarsest = .05;  // metres
 constexpr int kCell = 4;                          // pixels over whose means slopes are taken
 constexpr double kSameSurface = .03;              // of 1/z: neighbours within are one surface
 constexpr double kLeastCosine = .1;
-constexpr float kHold = .5f,
-                kEnd = 2.5f;      // voxels that a measured surface goes on beyond its border
-constexpr double kLook = 1.5;     // voxels before it where it has to be open
-constexpr float kFill = .25f;     // voxels that it may go beyond the solid ones
+// Voxels: a measured surface goes on so far beyond its border, and from there on bends to the solid
+// ones' boundary; so far before it must be open; so far beyond solid voxels it may go.
+constexpr float kHold = .5f, kEnd = 2.5f, kFill = .25f;
+constexpr double kLook = 1.5;
 constexpr float kSmallest = .1f;  // metres: smaller parts that nobody measured are none
 
 // Round distances make small files, and those most whose last bits are 0.
@@ -406,6 +406,7 @@ float distanceAtBorder(const ContinuedVoxel& v, const SmoothSolid& smooth, int p
   return solid + open * std::min(1.f, 2 * weight) * (goes_on - solid);
 }
 
+// Active where a measured surface goes on.
 FloatTree distancesAtBorders(const FloatTree& measured, const SmoothSolid& smooth, int parts,
                              float voxel_m) {
   ContinuationSettings s;
@@ -441,7 +442,6 @@ Leaf* surfaceLeaf(const Coord& origin, const SmoothSolid& smooth, int parts, flo
   return leaf;
 }
 
-// Only the band stays active; what is beyond has its sign.
 void roundDistances(FloatGrid* grid) {
   const float band = grid->background(), step = stepOf(band);
   std::vector<Leaf*> leaves;
