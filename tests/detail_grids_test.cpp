@@ -144,6 +144,8 @@ TEST(DetailGrids, GoIntoTheFileAndComeBackAsVoxels) {
     EXPECT_NEAR(findGrid<FloatGrid>("test", file.grids, name, "x")->voxelSize()[0], kEdge, 1e-6)
         << name;
   EXPECT_NEAR(findGrid<Vec3SGrid>("test", file.grids, "Cd", "x")->voxelSize()[0], kEdge, 1e-6);
+  const auto surface = findGrid<FloatGrid>("test", file.grids, "surface", "x");
+  EXPECT_EQ(surface->metaValue<int64_t>("dropped_parts"), 0);
   EXPECT_NEAR(findGrid<FloatGrid>("test", file.grids, "probability", "x")->voxelSize()[0], .1,
               1e-6);
   const SceneVoxels read = readSceneVdb(folder / "x.vdb");

@@ -18,7 +18,8 @@ using Values = openvdb::tree::ValueAccessor<const FloatTree, false>;
 
 const std::array<Coord, 6> kBeside = {Coord(-1, 0, 0), Coord(1, 0, 0),  Coord(0, -1, 0),
                                       Coord(0, 1, 0),  Coord(0, 0, -1), Coord(0, 0, 1)};
-constexpr int kLeastSamples = 12;
+// A plane is one where so much of the cube was measured, and distances grow as distances do.
+constexpr float kLeastShare = .2f, kLeastSlope = .6f, kMostSlope = 1.4f;
 
 // The plane by which a voxel goes on.
 struct Plane {
@@ -36,7 +37,7 @@ bool isBorder(Values* measured, const Coord& ijk) {
 }
 
 // The direction in which the measured distance grows around a voxel; 0 where that is not clear.
-Vector3f fittedNormal(Values* measured, const Coord& ijk, int half_width) {
+Vector3f fittedNormal(Values* measured, const Coord& ijk, int half_width, float voxel) {
   Eigen::Matrix4f squares = Eigen::Matrix4f::Zero();
   Eigen::Vector4f products = Eigen::Vector4f::Zero();
   const float cut_off = .99f * measured->tree().background();
@@ -49,11 +50,12 @@ Vector3f fittedNormal(Values* measured, const Coord& ijk, int half_width) {
     squares += row * row.transpose(), products += value * row;
     ++samples;
   }
-  if (samples < kLeastSamples) return Vector3f::Zero();
+  if (float(samples) < kLeastShare * std::pow(float(2 * half_width + 1), 3.f))
+    return Vector3f::Zero();
   squares.diagonal().head<3>().array() += 1e-3f * float(samples);
-  const Vector3f slope = squares.ldlt().solve(products).head<3>();
+  const Vector3f slope = squares.ldlt().solve(products).head<3>() / voxel;
   const float length = slope.norm();
-  return length > 0 && std::isfinite(length) ? Vector3f(slope / length) : Vector3f::Zero();
+  return length > kLeastSlope && length < kMostSlope ? Vector3f(slope / length) : Vector3f::Zero();
 }
 
 // By voxel; rows stay as voxels are added.
@@ -86,7 +88,8 @@ Planes bordersOf(const FloatTree& measured, float voxel, int plane_voxels) {
     for (auto value = leaves[i]->cbeginValueOn(); value; ++value) {
       const Coord ijk = value.getCoord();
       if (std::abs(*value) > near || !isBorder(&values, ijk)) continue;
-      found[i].push_back({ijk, {*value / voxel, fittedNormal(&values, ijk, plane_voxels), 0}});
+      found[i].push_back(
+          {ijk, {*value / voxel, fittedNormal(&values, ijk, plane_voxels, voxel), 0}});
     }
   });
   Planes planes;
