@@ -333,6 +333,7 @@ TEST(Fuse, TheSurfaceOfACaptureIsThatOfItsDepth) {
   f.bounds = CoordBBox(centre.offsetBy(-50), centre.offsetBy(50));
   const FloatGrid::Ptr plain = fused(c, f, .025f);
   const FloatGrid::Ptr surface = closedSurface(f, filledNodes(carved(c, f)), *plain);
+  EXPECT_EQ(openEdges(*surface), 0);
   openvdb::tools::GridSampler<FloatGrid, openvdb::tools::BoxSampler> of_surface(*surface),
       of_plain(*plain);
   double bias = 0, square = 0, plain_square = 0;
