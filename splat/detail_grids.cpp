@@ -19,13 +19,17 @@ using Leaf = FloatTree::LeafNodeType;
 
 constexpr float kReachSigmas = 3;
 constexpr float kBlurAlong = .5f, kBlurAcross = 1.5f;  // detail voxels, standard deviations
-constexpr float kShareSteps = 16;                      // of a density of 1
-// Round values make small files; those of colour are as fine as a display shows.
-constexpr float kColourSteps = 128;  // of the mantissa
+constexpr float kShareSteps = 8;                       // of a density of 1
+// Round values make small files. Those of colour are as fine as a display shows, in few bits.
+constexpr float kColourSteps = 128;
+// Further off the surface than that no sample at it looks, for which eight voxels are asked.
+constexpr float kColourReach = 2;        // detail voxels
+constexpr float kSameColour = 1 / 16.f;  // of display values: one for all voxels of a leaf
 
 float roundedColour(float c) {
   int exponent = 0;
-  const float mantissa = std::frexp(c, &exponent);
+  const float display = std::round(srgbFromLinear(c) * kColourSteps) / kColourSteps;
+  const float mantissa = std::frexp(linearFromSrgb(display), &exponent);
   return std::ldexp(std::round(mantissa * kColourSteps) / kColourSteps, exponent);
 }
 openvdb::Vec3f storedColour(const Vector3f& c) {
@@ -118,18 +122,24 @@ class VoxelColours {
   TokenMap<size_t> rows_;
 };
 
+// Deep inside, where the surface has no leaves.
+std::vector<CoordBBox> insideTiles(const FloatGrid& surface) {
+  std::vector<CoordBBox> boxes;
+  for (auto value = surface.cbeginValueAll(); value; ++value)
+    if (!value.isVoxelValue() && *value < 0) {
+      boxes.emplace_back();
+      value.getBoundingBox(boxes.back());
+    }
+  return boxes;
+}
+
 // How much of each voxel lies behind the surface, as if that were flat there.
 FloatGrid::Ptr shareBehind(const FloatGrid& surface) {
   const auto edge = float(surface.voxelSize()[0]);
   auto grid = FloatGrid::create(0);
   grid->setTransform(surface.transformPtr()->copy());
   FloatTree& tree = grid->tree();
-  for (auto value = surface.cbeginValueAll(); value; ++value)
-    if (!value.isVoxelValue() && *value < 0) {
-      CoordBBox box;
-      value.getBoundingBox(box);
-      tree.sparseFill(box, 1.f, true);
-    }
+  for (const CoordBBox& box : insideTiles(surface)) tree.sparseFill(box, 1.f, true);
   for (auto leaf = surface.constTree().cbeginLeaf(); leaf; ++leaf) {
     auto* to = new Leaf(leaf->origin(), 0.f, false);
     for (openvdb::Index n = 0; n < Leaf::SIZE; ++n) {
@@ -164,24 +174,26 @@ bool sampledColour(const Vector3f& p, const std::vector<uint32_t>& rows,
   return mass > 0;
 }
 
-// Where nothing was measured, all detail voxels of a voxel have its colour: there is no more to
-// say, and files stay small.
 struct ColourSettings {
   float edge_m;  // of the detail voxels
   int parts;     // of a voxel's edge
   bool is_measured;
 };
 
+// Where nothing was measured, and deep inside, all detail voxels of a voxel have its colour: there
+// is no more to say, and files stay small.
 ColourLeaf* colourLeaf(const Leaf& surface, const std::vector<uint32_t>& rows,
                        const std::vector<Sample>& samples, const VoxelColours& voxels,
                        const ColourSettings& s) {
   auto* leaf = new ColourLeaf(surface.origin(), openvdb::Vec3f(0), false);
+  const auto parts = float(s.parts);
+  const float reach = kColourReach * s.edge_m;
   for (openvdb::Index n = 0; n < Leaf::SIZE; ++n) {
-    if (!surface.isValueOn(n) && surface.getValue(n) > 0) continue;
+    const float distance = surface.getValue(n);
+    if (distance > reach) continue;
     const Coord ijk = surface.offsetToGlobalCoord(n);
     Vector3f p(float(ijk.x()) + .5f, float(ijk.y()) + .5f, float(ijk.z()) + .5f);
-    const auto parts = float(s.parts);
-    if (!s.is_measured) p = ((p / parts).array().floor() + .5f) * parts;
+    if (!s.is_measured || distance < -reach) p = ((p / parts).array().floor() + .5f) * parts;
     Vector3f colour;
     if (sampledColour(s.edge_m * p, rows, samples, &colour))
       for (int c = 0; c < 3; ++c) colour[c] = linearFromSrgb(colour[c]);
@@ -190,6 +202,21 @@ ColourLeaf* colourLeaf(const Leaf& surface, const std::vector<uint32_t>& rows,
     leaf->setValueOn(n, storedColour(colour));
   }
   return leaf;
+}
+
+// Whether nobody would tell the leaf's colours from the one in their middle.
+bool isOneColour(const ColourLeaf& leaf, openvdb::Vec3f* colour) {
+  Vector3f low = Vector3f::Constant(1e9f), high = -low;
+  for (auto value = leaf.cbeginValueOn(); value; ++value)
+    for (int c = 0; c < 3; ++c) {
+      const float display = srgbFromLinear((*value)[c]);
+      low[c] = std::min(low[c], display), high[c] = std::max(high[c], display);
+    }
+  if (!((high - low).maxCoeff() < kSameColour)) return false;
+  Vector3f middle = (low + high) / 2;
+  for (int c = 0; c < 3; ++c) middle[c] = linearFromSrgb(middle[c]);
+  *colour = storedColour(middle);
+  return true;
 }
 
 Vec3SGrid::Ptr colourAround(const FloatGrid& surface, const SceneVoxels& voxels,
@@ -204,15 +231,32 @@ Vec3SGrid::Ptr colourAround(const FloatGrid& surface, const SceneVoxels& voxels,
   const auto rows = samplesOf(leaves, samples, edge);
   const VoxelColours own(voxels);
   const FloatTree& measured = voxels.seen_distance->constTree();
+  const auto isMeasured = [&](const Coord& origin) {
+    return measured.probeConstLeaf(origin) != nullptr;
+  };
   std::vector<ColourLeaf*> coloured(leaves.size(), nullptr);
   tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {
-    const bool is_measured = measured.probeConstLeaf(leaves[i]->origin()) != nullptr;
-    coloured[i] = colourLeaf(*leaves[i], rows[i], samples, own, {edge, parts, is_measured});
+    coloured[i] = colourLeaf(*leaves[i], rows[i], samples, own,
+                             {edge, parts, isMeasured(leaves[i]->origin())});
   });
   auto grid = Vec3SGrid::create(openvdb::Vec3f(0));
   grid->setTransform(surface.transformPtr()->copy());
-  for (ColourLeaf* leaf : coloured) grid->tree().addLeaf(leaf);
-  grid->tree().prune();
+  Vec3STree& tree = grid->tree();
+  for (ColourLeaf* leaf : coloured) {
+    openvdb::Vec3f colour;
+    const bool is_tile = !isMeasured(leaf->origin()) && isOneColour(*leaf, &colour);
+    if (is_tile) tree.addTile(1, leaf->origin(), colour, true);
+    if (is_tile || leaf->isEmpty())
+      delete leaf;
+    else
+      tree.addLeaf(leaf);
+  }
+  tree.prune();
+  for (const CoordBBox& box : insideTiles(surface)) {
+    const openvdb::Vec3d middle = (box.getCenter() + openvdb::Vec3d(.5)) / parts;
+    const Vector3f place(float(middle.x()), float(middle.y()), float(middle.z()));
+    tree.sparseFill(box, storedColour(own.at(place)), true);
+  }
   grid->setVectorType(openvdb::VEC_INVARIANT);
   return grid;
 }

@@ -62,7 +62,7 @@ TEST(DetailGrids, AreNoneWhereNothingWasMeasured) {
   EXPECT_FALSE(grids.surface || grids.density || grids.colour);
 }
 
-TEST(DetailGrids, ColourIsThatOfTheDiscsInTheWholeBand) {
+TEST(DetailGrids, ColourIsThatOfTheDiscsWhereverOneLooks) {
   const DetailGrids grids = detailGrids(wall(), discs());
   const auto colour = grids.colour->getConstAccessor();
   for (int y = 4; y < 76; ++y)
@@ -73,10 +73,48 @@ TEST(DetailGrids, ColourIsThatOfTheDiscsInTheWholeBand) {
       const openvdb::Vec3f expected = y < 40 ? openvdb::Vec3f(1, 0, 0) : openvdb::Vec3f(0, 0, 1);
       ASSERT_LT((colour.getValue(c) - expected).length(), .02f) << c << colour.getValue(c);
     }
-  // Where the band goes there is a colour, also beyond all discs: that of the voxels.
-  for (auto value = grids.surface->cbeginValueOn(); value; ++value)
-    ASSERT_TRUE(colour.isValueOn(value.getCoord())) << value.getCoord();
+  // Also beyond all discs: that of the voxels.
   EXPECT_EQ(colour.getValue(Coord(70, 40, 1)), openvdb::Vec3f(0, 1, 0));
+}
+
+// A sample at the surface is the mean of eight voxels, and one of the fog lies in its own.
+TEST(DetailGrids, NoSampleOfColourMeetsAVoxelWithout) {
+  SceneVoxels v = wall();
+  for (const Coord& ijk : CoordBBox(Coord(0, 0, -6), Coord(19, 19, -1))) {  // and much inside
+    v.ijk.push_back(ijk);
+    v.colour_linear.emplace_back(0, 1, 0), v.density.push_back(.5f);
+    v.observed.push_back(0), v.probability.push_back(1), v.bfs_level.push_back(1);
+  }
+  const DetailGrids grids = detailGrids(v, discs());
+  const auto colour = grids.colour->getConstAccessor();
+  const auto surface = grids.surface->getConstAccessor();
+  for (auto value = grids.surface->cbeginValueOn(); value; ++value) {
+    const CoordBBox cell = CoordBBox::createCube(value.getCoord(), 2);
+    int inside = 0;
+    for (const Coord& c : cell) inside += surface.getValue(c) < 0;
+    if (inside == 0 || inside == 8) continue;
+    for (const Coord& c : cell) ASSERT_TRUE(colour.isValueOn(c)) << c;
+  }
+  int64_t tiles = 0;
+  for (auto value = grids.density->cbeginValueOn(); value; ++value) {
+    tiles += value.isTileValue();
+    CoordBBox box;
+    value.getBoundingBox(box);
+    for (const Coord& c : {box.min(), box.max()}) {
+      ASSERT_TRUE(colour.isValueOn(c)) << c;
+      ASSERT_GT(colour.getValue(c).length(), .5f) << c;
+    }
+  }
+  EXPECT_GT(tiles, 0);
+}
+
+// Files stay small where nothing was measured and colours hardly differ.
+TEST(DetailGrids, WhatWasMadeUpInOneColourIsTiles) {
+  const SceneVoxels v = wall();
+  const DetailGrids grids = detailGrids(v, discs());
+  for (auto leaf = grids.colour->constTree().cbeginLeaf(); leaf; ++leaf)
+    EXPECT_TRUE(v.seen_distance->constTree().probeConstLeaf(leaf->origin())) << leaf->origin();
+  EXPECT_GT(grids.colour->constTree().activeTileCount(), 10u);
 }
 
 TEST(DetailGrids, DensityIsTheShareOfAVoxelBehindTheSurface) {
@@ -106,6 +144,8 @@ TEST(DetailGrids, GoIntoTheFileAndComeBackAsVoxels) {
     EXPECT_NEAR(findGrid<FloatGrid>("test", file.grids, name, "x")->voxelSize()[0], kEdge, 1e-6)
         << name;
   EXPECT_NEAR(findGrid<Vec3SGrid>("test", file.grids, "Cd", "x")->voxelSize()[0], kEdge, 1e-6);
+  const auto surface = findGrid<FloatGrid>("test", file.grids, "surface", "x");
+  EXPECT_EQ(surface->metaValue<int64_t>("dropped_parts"), 0);
   EXPECT_NEAR(findGrid<FloatGrid>("test", file.grids, "probability", "x")->voxelSize()[0], .1,
               1e-6);
   const SceneVoxels read = readSceneVdb(folder / "x.vdb");

@@ -11,11 +11,13 @@
 #include <map>
 #include <random>
 
+#include "encoder/views/read_views.h"
 #include "tests/expect_error.h"
 #include "tests/files.h"
 #include "vdb/scene_vdb.h"
 #include "vdb/threads.h"
 #include "vdb/token_grid.h"
+#include "vdb/vdb_file.h"
 
 namespace vdbc {
 namespace {
@@ -203,6 +205,155 @@ TEST(Fuse, TheSurfaceIsClosedAndStandsWhereItWasMeasured) {
   // The made-up block is in it.
   const Vector3d inside = f.toWorld({-6, -5, 5});
   EXPECT_LT(sample.wsSample({inside.x(), inside.y(), inside.z()}), 0);
+}
+
+/// The plane z = 0 from above, as far as x = 1.2 m at both sides.
+Capture plane() {
+  Capture c;
+  c.distance = [](const Vector3d& p) { return std::abs(p.z()); };
+  c.add({0, 0, 2}, {0, .001, 0});
+  return c;
+}
+
+/// Voxels that the plane goes through, within 1.7 m.
+std::vector<Coord> voxelsOfPlane(const VoxelFrame& f) {
+  std::vector<Coord> solid;
+  const Vector3d up = f.world_from_grid.linear().row(2);
+  for (const Coord& ijk : f.bounds) {
+    const Vector3d centre = f.toWorld(Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5));
+    if (centre.norm() < 1.7 && std::abs(centre.z()) < .05 * up.cwiseAbs().sum())
+      solid.push_back(ijk);
+  }
+  return solid;
+}
+
+/// Where the level set first crosses 0 on the way down; not a number: nowhere near.
+double heightOf(const FloatGrid& surface, double x, double y) {
+  openvdb::tools::GridSampler<FloatGrid, openvdb::tools::BoxSampler> sample(surface);
+  constexpr double kStep = .002;
+  for (double z = .15; z > -.15; z -= kStep) {
+    const double above = double(sample.wsSample({x, y, z})),
+                 below = double(sample.wsSample({x, y, z - kStep}));
+    if (above >= 0 && below < 0) return z - kStep * above / (above - below);
+  }
+  return NAN;
+}
+
+// The voxels' boundary lies up to a voxel before the plane. It is reached in a slope, not a step.
+TEST(Fuse, AMeasuredPlaneGoesOnBeyondItsBorder) {
+  const Capture c = plane();
+  const VoxelFrame f = frameOf(-18, 17);
+  const FloatGrid::Ptr surface = closedSurface(f, voxelsOfPlane(f), *fused(c, f, .025f));
+  double farthest = 0;
+  for (double side : {-1., 1.})
+    for (double y = -.6; y < .61; y += .1) {
+      double before = 0;
+      for (double x = 1; x < 1.5; x += .01) {
+        const double height = heightOf(*surface, side * x, y);
+        ASSERT_FALSE(std::isnan(height)) << x << " " << y;
+        if (x < 1.33) {  // 8 cm beyond the last ray
+          EXPECT_LT(std::abs(height), .1 / 3) << x << " " << y;
+        }
+        EXPECT_LT(std::abs(height - before), .02) << x << " " << y;
+        before = height, farthest = std::max(farthest, height);
+      }
+    }
+  EXPECT_GT(farthest, .05);  // there is something to be reached
+}
+
+TEST(Fuse, WhatViewsSawFreeIsNeverFilled) {
+  Capture c = room();
+  // A board stands in the air: its border, its shadow on the wall, and what goes on behind it.
+  const auto walls = c.distance;
+  c.distance = [walls](const Vector3d& p) {
+    const Vector3d off = (p - Vector3d(1.2, 1, 1)).cwiseAbs() - Vector3d(.02, .3, .4);
+    return std::min(walls(p), off.cwiseMax(0).norm() + std::min(0., off.maxCoeff()));
+  };
+  Capture seen;
+  seen.distance = c.distance;
+  seen.add({2.4, 2, 1.3}, {0, .8, .9}), seen.add({.6, 2, 1.5}, {2.5, 0, .5});
+  const VoxelFrame f = frameOf(-16, 47);
+  const FloatGrid::Ptr measured = fused(seen, f, .025f);
+  const FloatGrid::Ptr surface = closedSurface(f, filledNodes(carved(seen, f)), *measured);
+  EXPECT_EQ(openEdges(*surface), 0);
+  const auto values = surface->getConstAccessor();
+  int64_t free = 0;
+  for (auto value = measured->cbeginValueOn(); value; ++value)
+    if (*value > 0) {
+      ++free;
+      ASSERT_GE(values.getValue(value.getCoord()), 0) << value.getCoord();
+    }
+  EXPECT_GT(free, 10000);
+}
+
+/// In detail voxels of 2.5 cm.
+FloatGrid::Ptr measuredGrid(const VoxelFrame& f, const CoordBBox& box,
+                            const std::function<float(const Coord&)>& distance) {
+  VoxelFrame detail = f;
+  detail.voxel_m = .025f;
+  const auto grid = FloatGrid::create(kDetailBand * detail.voxel_m);
+  grid->setTransform(fileTransform(detail));
+  for (const Coord& c : box) grid->tree().setValueOn(c, distance(c));
+  return grid;
+}
+
+TEST(Fuse, SmallPartsAreDroppedUnlessTheyWereMeasured) {
+  const VoxelFrame f = frameOf(-16, 15);
+  constexpr float kBand = kDetailBand * .025f;
+  // One voxel alone, whose rounded shape is 5 cm wide; two together; and one in which a pole of
+  // 2.5 cm was measured, free around.
+  const std::vector<Coord> solid = {Coord(-8, 0, 0), Coord(0, 0, 0), Coord(1, 0, 0),
+                                    Coord(8, 0, 0)};
+  const FloatGrid::Ptr measured =
+      measuredGrid(f, CoordBBox(Coord(24, -8, -8), Coord(43, 11, 11)), [&](const Coord& c) {
+        const bool is_pole = c.x() == 33 && c.y() == 1 && c.z() >= 0 && c.z() <= 2;
+        return is_pole ? -.0125f : kBand;
+      });
+  const FloatGrid::Ptr surface = closedSurface(f, solid, *measured);
+  const auto isSolid = [&](const Coord& c) { return surface->tree().getValue(c) < 0; };
+  EXPECT_FALSE(isSolid({-31, 1, 1}));
+  EXPECT_TRUE(isSolid({1, 1, 1}));
+  EXPECT_TRUE(isSolid({6, 1, 1}));
+  EXPECT_TRUE(isSolid({33, 1, 1}));
+  EXPECT_EQ(surface->metaValue<int64_t>("dropped_parts"), 1);
+}
+
+// Noise and holes of a sensor, and cameras that do not quite agree.
+TEST(Fuse, TheSurfaceOfACaptureIsThatOfItsDepth) {
+  const std::string folder = sharedFile("data/rgbd_redkitchen");
+  if (folder.empty()) GTEST_SKIP() << "no kitchen";
+  ReadViewsSettings reading;
+  reading.frames = {0, 6, 12, 18};
+  Capture c;
+  for (const View& v : readViews(folder, reading))
+    c.cameras.push_back(v.camera), c.depths.push_back(v.depth);
+  VoxelFrame f;
+  const Vector3d middle = c.cameras[0].unproject(320, 240, 2) / .1;
+  const Coord centre(int(middle.x()), int(middle.y()), int(middle.z()));
+  f.bounds = CoordBBox(centre.offsetBy(-50), centre.offsetBy(50));
+  const FloatGrid::Ptr plain = fused(c, f, .025f);
+  const FloatGrid::Ptr surface = closedSurface(f, filledNodes(carved(c, f)), *plain);
+  EXPECT_EQ(openEdges(*surface), 0);
+  openvdb::tools::GridSampler<FloatGrid, openvdb::tools::BoxSampler> of_surface(*surface),
+      of_plain(*plain);
+  double bias = 0, square = 0, plain_square = 0;
+  int n = 0, lost = 0;
+  for (const DepthView& view : c.views()) {
+    const std::vector<float> depth = usableDepth(view, {});
+    for (size_t i = 0; i < depth.size(); i += 7) {
+      if (!(depth[i] > 0)) continue;
+      const Vector3d p =
+          view.camera.unproject(double(i % 640) + .5, double(i / 640) + .5, double(depth[i]));
+      const openvdb::Vec3d at(p.x(), p.y(), p.z());
+      const double d = double(of_surface.wsSample(at));
+      bias += d, square += d * d, plain_square += std::pow(double(of_plain.wsSample(at)), 2), ++n;
+      lost += std::abs(d) > .999 * double(surface->background());
+    }
+  }
+  ASSERT_GT(n, 50000);
+  EXPECT_LT(std::abs(bias / n), .003);
+  EXPECT_LT(std::sqrt(square), 1.2 * std::sqrt(plain_square));
+  EXPECT_LT(lost, .001 * n);
 }
 
 TEST(Fuse, DistancesAreThoseOfAnEikonal) {

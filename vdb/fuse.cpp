@@ -1,13 +1,15 @@
 #include "vdb/fuse.h"
 
-#include <openvdb/tools/FastSweeping.h>
-#include <openvdb/tools/SignedFloodFill.h>
+#include <openvdb/Metadata.h>
 #include <tbb/parallel_for.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 
+#include "vdb/continuation.h"
 #include "vdb/error.h"
+#include "vdb/narrow_band.h"
 #include "vdb/vdb_file.h"
 
 namespace vdbc {
@@ -21,7 +23,11 @@ constexpr double kFinest = .01, kCoarsest = .05;  // metres
 constexpr int kCell = 4;                          // pixels over whose means slopes are taken
 constexpr double kSameSurface = .03;              // of 1/z: neighbours within are one surface
 constexpr double kLeastCosine = .1;
-constexpr float kShell = .67f;  // of the band: how thick at least what was measured is
+// Voxels: a measured surface goes on so far beyond its border, and from there on bends to the solid
+// ones' boundary; so far before it must be open; so far beyond solid voxels it may go.
+constexpr float kHold = .5f, kEnd = 2.5f, kFill = .25f;
+constexpr double kLook = 1.5;
+constexpr float kSmallest = .1f;  // metres: smaller parts that nobody measured are none
 
 // Round distances make small files, and those most whose last bits are 0.
 float stepOf(float band) {
@@ -159,13 +165,12 @@ VoxelFrame detailFrame(const VoxelFrame& frame, int parts) {
   return detail;
 }
 
-// Leaves of the detail grid that touch the voxels, grown by a band; in order.
-std::vector<Coord> leavesOver(const std::vector<Coord>& voxels, int parts) {
+// Leaves of the detail grid that touch the voxels, grown by so many detail voxels; in order.
+std::vector<Coord> leavesOver(const std::vector<Coord>& voxels, int parts, int grown) {
   std::vector<Coord> origins;
   for (const Coord& ijk : voxels) {
-    const Coord low(ijk.x() * parts - kDetailBand, ijk.y() * parts - kDetailBand,
-                    ijk.z() * parts - kDetailBand);
-    const Coord high = low.offsetBy(parts - 1 + 2 * kDetailBand);
+    const Coord low(ijk.x() * parts - grown, ijk.y() * parts - grown, ijk.z() * parts - grown);
+    const Coord high = low.offsetBy(parts - 1 + 2 * grown);
     const int mask = ~int(Leaf::DIM - 1), step = int(Leaf::DIM);
     for (int x = low.x() & mask; x <= high.x(); x += step)
       for (int y = low.y() & mask; y <= high.y(); y += step)
@@ -299,19 +304,28 @@ class SmoothSolid {
     float distance(const Vector3d& p) {
       const Vector3d low = (p.array() - .5).floor();
       const Vector3d f = p.array() - .5 - low.array();
+      look(Coord(int(low.x()), int(low.y()), int(low.z())));
       double share = 0;
-      for (int k = 0; k < 8; ++k) {
-        const Coord c(int(low.x()) + (k & 1), int(low.y()) + (k >> 1 & 1), int(low.z()) + (k >> 2));
-        if (cells_.isValueOn(c))
+      for (size_t k = 0; k < 8; ++k)
+        if (solid_[k])
           share += (k & 1 ? f.x() : 1 - f.x()) * (k >> 1 & 1 ? f.y() : 1 - f.y()) *
                    (k >> 2 ? f.z() : 1 - f.z());
-      }
       return float((.5 - share) * voxel_m_);
     }
 
    private:
+    // Neighbouring places mostly lie between the same voxels.
+    void look(const Coord& low) {
+      if (low == low_) return;
+      low_ = low;
+      for (int k = 0; k < 8; ++k)
+        solid_[size_t(k)] = cells_.isValueOn(low.offsetBy(k & 1, k >> 1 & 1, k >> 2));
+    }
+
     openvdb::tree::ValueAccessor<const MaskTree, false> cells_;
     double voxel_m_;
+    Coord low_ = Coord::max();
+    std::array<bool, 8> solid_{};
   };
 
  private:
@@ -328,7 +342,7 @@ FloatGrid::Ptr fuseDepth(const VoxelFrame& frame, const SeenSpace& seen,
                     [&](size_t i) { fuse_views[i] = fuseView(views[i], frame, settings.carving); });
   const int parts = partsOf(frame, fuse_views, settings.voxel_m);
   const VoxelFrame detail = detailFrame(frame, parts);
-  const std::vector<Coord> origins = leavesOver(filledNodes(seen), parts);
+  const std::vector<Coord> origins = leavesOver(filledNodes(seen), parts, kDetailBand);
   std::vector<Leaf*> leaves(origins.size(), nullptr);
   tbb::parallel_for(size_t(0), origins.size(),
                     [&](size_t i) { leaves[i] = fuseLeaf(detail, origins[i], fuse_views); });
@@ -346,76 +360,96 @@ int detailPartsOf(const VoxelFrame& frame, const openvdb::GridBase& fused) {
 
 namespace {
 
+// Free space is cut out. Behind what was measured there is something, as far as the views can tell:
+// it begins at a distance of 0 and ends where they tell no more.
+float cutBack(float solid, float measured, float band) {
+  if (measured > 0) return std::max(solid, measured);
+  const float begins = std::min(measured, -1e-3f * band), ends = -band - begins;
+  return std::clamp(solid, begins, std::max(begins, ends));
+}
+
+float smoothStep(float t) { return t <= 0 ? 0.f : t >= 1 ? 1.f : t * t * (3 - 2 * t); }
+
+// How far before a plane (behind: negative) the boundary of the solid voxels lies, in voxels, on
+// the way from `kLook` before it; 0 where there is none.
+double boundaryBefore(const Vector3d& foot, const Vector3d& normal, SmoothSolid::Lookup* solids) {
+  const auto at = [&](double s) { return double(solids->distance(foot + s * normal)); };
+  double inside = .5, outside = kLook;
+  while (inside >= -1 && at(inside) >= 0) outside = inside, inside -= .5;
+  if (inside < -1) return 0;
+  for (int k = 0; k < 4; ++k) {
+    const double middle = (inside + outside) / 2;
+    (at(middle) < 0 ? inside : outside) = middle;
+  }
+  return (inside + outside) / 2;
+}
+
+// The boundary of the solid voxels lies up to a voxel before or behind the surface that is in them.
+// Beyond the borders of what was measured a slope leads to it from the measured surface's plane.
+float distanceAtBorder(const ContinuedVoxel& v, const SmoothSolid& smooth, int parts,
+                       float voxel_m) {
+  SmoothSolid::Lookup solids(smooth);
+  const float band = float(kDetailBand) * voxel_m / float(parts);
+  const Vector3d p = Vector3d(v.ijk.x() + .5, v.ijk.y() + .5, v.ijk.z() + .5) / parts,
+                 normal = v.normal.cast<double>(), foot = p - double(v.distance / voxel_m) * normal;
+  const float solid = solids.distance(p);
+  const float weight = smoothStep((kEnd - v.reach / voxel_m) / (kEnd - kHold));
+  if (weight == 0) return solid;
+  const float slope =
+      weight == 1 ? 0 : (1 - weight) * float(boundaryBefore(foot, normal, &solids)) * voxel_m;
+  // Where no voxel is at the plane or before it, nothing goes on.
+  const float sheet = std::min(solids.distance(foot), solids.distance(foot + .5 * normal));
+  const float goes_on =
+      std::max(cutBack(solid, v.distance - slope, band), std::min(solid, sheet - kFill * voxel_m));
+  // Where voxels stand on the plane, what they are is not told from it.
+  const float open = .5f + solids.distance(foot + kLook * normal) / voxel_m;
+  return solid + open * std::min(1.f, 2 * weight) * (goes_on - solid);
+}
+
+// Active where a measured surface goes on.
+FloatTree distancesAtBorders(const FloatTree& measured, const SmoothSolid& smooth, int parts,
+                             float voxel_m) {
+  ContinuationSettings s;
+  s.plane_voxels = (parts + 1) / 2;
+  s.reach = kEnd * voxel_m, s.before = float(kLook) * voxel_m, s.behind = measured.background();
+  const std::vector<ContinuedVoxel> continued =
+      continueDistance(measured, voxel_m / float(parts), s);
+  std::vector<float> distances(continued.size());
+  tbb::parallel_for(size_t(0), continued.size(), [&](size_t i) {
+    distances[i] = distanceAtBorder(continued[i], smooth, parts, voxel_m);
+  });
+  FloatTree tree(measured.background());
+  openvdb::tree::ValueAccessor<FloatTree, false> values(tree);
+  for (size_t i = 0; i < continued.size(); ++i) values.setValueOn(continued[i].ijk, distances[i]);
+  return tree;
+}
+
 // Distances of the right sign, right where they are near 0, in all voxels of a leaf.
 Leaf* surfaceLeaf(const Coord& origin, const SmoothSolid& smooth, int parts, float band,
-                  const Leaf* measured) {
+                  const Leaf* measured, const Leaf* at_border) {
   SmoothSolid::Lookup solids(smooth);
   auto* leaf = new Leaf(origin, band, true);
   for (openvdb::Index n = 0; n < Leaf::SIZE; ++n) {
-    const Coord ijk = leaf->offsetToGlobalCoord(n);
-    float distance = solids.distance(Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5) / parts);
-    if (measured && measured->isValueOn(n)) {
-      // Free space is cut out; close behind what was measured there is something.
-      const float f = measured->getValue(n);
-      distance = std::max(distance, f);
-      if (f < 0) distance = std::min(distance, std::max(f, -f - kShell * band));
+    if (at_border && at_border->isValueOn(n)) {
+      leaf->setValueOnly(n, at_border->getValue(n));
+      continue;
     }
-    leaf->setValueOnly(n, distance);
+    const Coord ijk = leaf->offsetToGlobalCoord(n);
+    const float solid = solids.distance(Vector3d(ijk.x() + .5, ijk.y() + .5, ijk.z() + .5) / parts);
+    const bool is_measured = measured && measured->isValueOn(n);
+    leaf->setValueOnly(n, is_measured ? cutBack(solid, measured->getValue(n), band) : solid);
   }
   return leaf;
 }
 
-// Leaves only those voxels active that have the other sign within kDetailBand along the axes, one
-// axis after the other: more than the band needs, and no more than distances are looked for.
-void keepBand(FloatGrid* grid) {
-  constexpr int kReach = kDetailBand, kSide = int(Leaf::DIM) + 2 * kReach;
-  const FloatTree& tree = grid->constTree();
-  std::vector<Leaf*> leaves;
-  grid->tree().getNodes(leaves);
-  std::vector<openvdb::util::NodeMask<3>> masks(leaves.size());
-  tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {
-    const openvdb::tree::ValueAccessor<const FloatTree, false> values(tree);
-    // Bits: 1 something negative is near, 2 something positive.
-    std::array<uint8_t, kSide * kSide * kSide> near, swap;
-    size_t k = 0;
-    for (int x = -kReach; x < kSide - kReach; ++x)
-      for (int y = -kReach; y < kSide - kReach; ++y)
-        for (int z = -kReach; z < kSide - kReach; ++z)
-          near[k++] = values.getValue(leaves[i]->origin().offsetBy(x, y, z)) < 0 ? 1 : 2;
-    for (int step : {1, kSide, kSide * kSide}) {
-      for (int at = 0; at < int(near.size()); ++at) {
-        uint8_t bits = near[size_t(at)];
-        for (int d = 1; d <= kReach; ++d) {
-          if (at - d * step >= 0) bits |= near[size_t(at - d * step)];
-          if (at + d * step < int(near.size())) bits |= near[size_t(at + d * step)];
-        }
-        swap[size_t(at)] = bits;
-      }
-      std::swap(near, swap);
-    }
-    for (openvdb::Index n = 0; n < Leaf::SIZE; ++n) {
-      const Coord c = Leaf::offsetToLocalCoord(n).offsetBy(kReach);
-      if (near[size_t((c.x() * kSide + c.y()) * kSide + c.z())] == 3) masks[i].setOn(n);
-    }
-  });
-  for (size_t i = 0; i < leaves.size(); ++i) leaves[i]->setValueMask(masks[i]);
-}
-
-// Only the band stays active; what is beyond has its sign.
-void trimBand(float band, FloatGrid* grid) {
-  const float step = stepOf(band);
+void roundDistances(FloatGrid* grid) {
+  const float band = grid->background(), step = stepOf(band);
   std::vector<Leaf*> leaves;
   grid->tree().getNodes(leaves);
   tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {
-    for (openvdb::Index n = 0; n < Leaf::SIZE; ++n) {
-      const float d = leaves[i]->getValue(n);
-      if (leaves[i]->isValueOn(n) && std::abs(d) < band)
-        leaves[i]->setValueOnly(n, roundedTo(step, d));
-      else
-        leaves[i]->setValueOff(n, d < 0 ? -band : band);
-    }
+    for (auto value = leaves[i]->beginValueOn(); value; ++value)
+      value.setValue(roundedTo(step, *value));
   });
-  openvdb::tools::signedFloodFill(grid->tree());
 }
 
 }  // namespace
@@ -426,16 +460,23 @@ FloatGrid::Ptr closedSurface(const VoxelFrame& frame, const std::vector<Coord>& 
   const VoxelFrame detail = detailFrame(frame, parts);
   const float band = float(kDetailBand) * detail.voxel_m;
   const SmoothSolid smooth(solid, double(frame.voxel_m));
-  const std::vector<Coord> origins = leavesOver(solid, parts);
+  const FloatTree& measured = fused.constTree();
+  const FloatTree at_borders = distancesAtBorders(measured, smooth, parts, frame.voxel_m);
+  // What was measured may go on a band behind the voxels, and distances are asked for beyond.
+  const std::vector<Coord> origins = leavesOver(solid, parts, 2 * kDetailBand);
   std::vector<Leaf*> leaves(origins.size(), nullptr);
   tbb::parallel_for(size_t(0), origins.size(), [&](size_t i) {
-    leaves[i] =
-        surfaceLeaf(origins[i], smooth, parts, band, fused.constTree().probeConstLeaf(origins[i]));
+    leaves[i] = surfaceLeaf(origins[i], smooth, parts, band, measured.probeConstLeaf(origins[i]),
+                            at_borders.probeConstLeaf(origins[i]));
   });
   FloatGrid::Ptr grid = gridOf(leaves, detail);
-  keepBand(grid.get());
-  grid = openvdb::tools::sdfToSdf(*grid);
-  trimBand(band, grid.get());
+  const auto isMeasured = [&](const Coord& ijk) { return measured.getValue(ijk) < 0; };
+  const int64_t dropped =
+      dropSmallParts(int(std::lround(kSmallest / detail.voxel_m)), isMeasured, &grid->tree());
+  grid->insertMeta("dropped_parts", openvdb::Int64Metadata(dropped));
+  solveDistances(detail.voxel_m, kDetailBand, &grid->tree());
+  roundDistances(grid.get());
+  grid->tree().prune();
   grid->setGridClass(openvdb::GRID_LEVEL_SET);
   return grid;
 }

@@ -31,8 +31,11 @@ FloatGrid::Ptr fuseDepth(const VoxelFrame& frame, const SeenSpace& seen,
 /// not fit the frame.
 int detailPartsOf(const VoxelFrame& frame, const openvdb::GridBase& fused);
 
-/// One closed level set: the boundary of the solid voxels, smoothed, cut back to what was measured
-/// where the views saw it. In the grid of `fused`, half width kDetailBand.
+/// One closed level set: the boundary of the solid voxels, smoothed, where the views saw it that of
+/// what was measured, and over two and a half voxels beyond the borders a slope between both. In
+/// the grid of `fused`, half width kDetailBand. Parts smaller than .1 m along all axes of which
+/// nothing was measured are left out; the grid's metadata `dropped_parts` is how many. Parallel;
+/// the same values for any number of threads.
 FloatGrid::Ptr closedSurface(const VoxelFrame& frame, const std::vector<Coord>& solid,
                              const FloatGrid& fused);
 
