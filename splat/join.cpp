@@ -30,10 +30,10 @@ constexpr float kPlaneSigma = .9f;        // of a disc that continues a plane, v
 constexpr float kPlaneThickness = .003f;  // metres
 constexpr float kBehind = .03f;  // metres; what continues a plane lies behind what was seen of it
 
-constexpr int kSideDirections = 4;          // to both sides each, in which a Gaussian is looked at
-constexpr float kInner = 1.3f, kOuter = 3;  // sigmas
-constexpr int kMostCuts = 8, kMostPushes = 2;
-constexpr float kCut = .7f;              // what a cut leaves of a Gaussian's width
+constexpr int kSideDirections = 4;  // to both sides each, in which a Gaussian is looked at
+constexpr float kInner = 1.3f, kOuter = 3.3f;  // sigmas; beyond nothing is drawn
+constexpr int kMostCuts = 14, kMostPushes = 2;
+constexpr float kCut = .85f;             // what a cut leaves of a Gaussian's width
 constexpr float kFarSide = 3;            // sigmas to the other side, which stays where it is
 constexpr float kPush = .03f;            // metres
 constexpr float kLeastVariance = 1e-8f;  // m^2
@@ -49,6 +49,7 @@ constexpr float kOtherThing = .3f;  // display sRGB
 constexpr float kLeak = .05f;  // of a difference in colour on its way from voxel to voxel: a metre
 constexpr int kRounds = 60;
 
+constexpr int kRimParts = 2;  // along both sides of a flat disc that meets what was seen
 constexpr float kWiden = 1.4f, kLeastOpacity = .95f;  // of a voxel's Gaussian
 constexpr float kTileSigmas = 2.6f;                   // by which tiles are widened to close up
 
@@ -140,9 +141,11 @@ class Bounds {
         const Vector3f side = along / std::sqrt(to_side.dot(along) + kLeastVariance);
         const Vector3d inner = project(v, b.mean + kInner * side),
                        outer = project(v, b.mean + kOuter * side);
-        // Gaussians are drawn in the order of their centres, which matters where they are opaque.
-        const float drawn_at = float(std::min(centre.z(), inner.z() - .75 * double(deep)));
-        if (before(inner, drawn_at) || before(outer, float(outer.z()) - .5f * deep))
+        // Gaussians are drawn in the order of their centres.
+        const auto drawn_at = [&](const Vector3d& uvz, double depth) {
+          return float(std::min(centre.z(), uvz.z() - depth * double(deep)));
+        };
+        if (before(inner, drawn_at(inner, .75)) || before(outer, drawn_at(outer, .5)))
           return {true, side};
       }
     }
@@ -416,27 +419,53 @@ Blob drawn(const Voxel& v, float voxel_m) {
   return b;
 }
 
-// What may be seen of the voxels, merged where neighbours agree and no disc is near.
+// A flat disc that meets what was seen as smaller ones, which reach less far into it.
+std::vector<Blob> rimParts(const Blob& disc, const Matrix3f& axes, float voxel_m) {
+  std::vector<Blob> parts;
+  const auto offset = [&](int i) { return (float(i) + .5f) / kRimParts - .5f; };
+  for (int i = 0; i < kRimParts; ++i)
+    for (int j = 0; j < kRimParts; ++j) {
+      parts.push_back(scaled(disc, 1.f / kRimParts));
+      parts.back().mean += voxel_m * (offset(i) * axes.col(0) + offset(j) * axes.col(1));
+    }
+  return parts;
+}
+
+// What may be seen of a voxel.
+struct Visible {
+  std::vector<Blob> blobs;
+  bool may_merge = false;  // it is whole and no disc is near
+};
+Visible visibleOf(const Voxel& voxel, const Bounds& bounds, float voxel_m) {
+  const Blob whole = drawn(voxel, voxel_m);
+  const bool at_rim = voxel.pull > 0;
+  Visible v;
+  for (Blob b : at_rim&& voxel.plane ? rimParts(whole, voxel.plane->axes, voxel_m)
+                                     : std::vector<Blob>{whole}) {
+    // What a view saw there is a disc already.
+    if (bounds.sees(b.mean, voxel_m)) continue;
+    const bool is_whole = !bounds.standsBefore(b);
+    if (!is_whole && !bounds.clip(&b)) continue;
+    v.blobs.push_back(b);
+    v.may_merge = is_whole && !at_rim;
+  }
+  return v;
+}
+
+// What may be seen of all voxels, merged where neighbours agree.
 std::vector<Blob> visibleBlobs(const std::vector<Voxel>& voxels, const Bounds& bounds,
                                float voxel_m) {
-  enum Fate : uint8_t { kDropped, kAlone, kMerged };
-  std::vector<Fate> fates(voxels.size(), kDropped);
-  std::vector<Blob> blobs(voxels.size());
-  tbb::parallel_for(size_t(0), voxels.size(), [&](size_t i) {
-    blobs[i] = drawn(voxels[i], voxel_m);
-    // What a view saw there is a disc already.
-    if (bounds.sees(blobs[i].mean, voxel_m)) return;
-    if (!bounds.standsBefore(blobs[i]))
-      fates[i] = voxels[i].pull > 0 ? kAlone : kMerged;
-    else if (bounds.clip(&blobs[i]))
-      fates[i] = kAlone;
-  });
+  std::vector<Visible> all(voxels.size());
+  tbb::parallel_for(size_t(0), voxels.size(),
+                    [&](size_t i) { all[i] = visibleOf(voxels[i], bounds, voxel_m); });
   // Gaussians that overlap have to be tiles before their moments add up to those of a larger tile.
   std::vector<Blob> tiles, visible;
-  for (size_t i = 0; i < voxels.size(); ++i) {
-    if (fates[i] == kMerged) tiles.push_back(scaled(blobs[i], 1 / kTileSigmas));
-    if (fates[i] == kAlone) visible.push_back(blobs[i]);
-  }
+  for (const Visible& v : all)
+    for (const Blob& b : v.blobs)
+      if (v.may_merge)
+        tiles.push_back(scaled(b, 1 / kTileSigmas));
+      else
+        visible.push_back(b);
   MergeSettings merging;
   merging.cell_m = 2 * voxel_m;
   tiles = mergeAlike(tiles, merging, [&](const Blob& tile) {
