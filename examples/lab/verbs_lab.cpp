@@ -183,9 +183,10 @@ Verb evalVerb() {
 }
 
 Program vdbLab() {
-  Program lab{"vdb_lab",
-              "Furnished rooms, training and studies of vdb_complete.",
-              {trainEncoderVerb(), trainMarVerb(), evalVerb(), tablesVerb(), compareVerb()}};
+  Program lab{
+      "vdb_lab",
+      "Furnished rooms, training and studies of vdb_complete.",
+      {trainEncoderVerb(), trainMarVerb(), packVerb(), evalVerb(), tablesVerb(), compareVerb()}};
   for (Verb& v : makeRoomsVerbs()) lab.verbs.push_back(std::move(v));
   return lab;
 }
