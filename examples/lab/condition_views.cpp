@@ -67,7 +67,7 @@ std::vector<uint8_t> drawHoles(int width, int height, Random& random) {
   std::vector<uint8_t> hole(size_t(width) * size_t(height), 0);
   for (int n = int(uniform(random, 0, 14)); n > 0; --n) {
     const double x = uniform(random, 0, width), y = uniform(random, 0, height);
-    const double a = uniform(random, 4, 40), b = uniform(random, 4, 40);
+    const double a = width * uniform(random, .018, .18), b = width * uniform(random, .018, .18);
     for (int j = 0; j < height; ++j)
       for (int i = 0; i < width; ++i)
         if (std::pow((i - x) / a, 2) + std::pow((j - y) / b, 2) < 1)
