@@ -88,7 +88,7 @@ struct PackedSamples {
   SampleSource source;          // reads the room's file each time
   int64_t count = 0;            // several a room, half of them of two far views
 };
-/// Throws Error where the folder has no rooms or another encoder's.
+/// Throws Error where the folder has no rooms or says that they are another encoder's.
 PackedSamples packedSamples(const std::string& folder, const std::string& encoder_hash);
 
 /// Makes the folder and notes the encoder in it, whose latents its rooms will hold. Throws Error

@@ -1,7 +1,8 @@
 // Rooms packed for the completer's training.
 #include <chrono>
-#include <cstdio>
+#include <cmath>
 #include <filesystem>
+#include <limits>
 #include <memory>
 #include <nlohmann/json.hpp>
 #include <optional>
@@ -116,6 +117,7 @@ std::optional<Packed> tryPackRoom(uint64_t seed, const Encoder& encoder, Progres
 
 void cookPack(const PackOptions& o, const Run& run, Progress& progress) {
   const Encoder encoder(weightsFolder(o.weights) + "/encoder.safetensors");
+  roomAssets();  // refused now where they are missing, not room by room
   startPackedFolder(o.output, encoder.hash());
   progress.start("pack rooms");
   for (size_t i = 0; i < o.seeds.size(); ++i) {
@@ -131,7 +133,7 @@ void cookPack(const PackOptions& o, const Run& run, Progress& progress) {
       result["bytes"] = writePackedRoom(packed->room, path);
       result["conditions"] = packed->room.conditions.size();
     }
-    result["seconds"] = secondsSince(start);
+    result["seconds"] = std::round(10 * secondsSince(start)) / 10;
     printResult(run.json, result, textOf(result));
   }
   progress.end();
@@ -148,6 +150,7 @@ Verb packVerb() {
             {ranges("--seeds LIST", &o->seeds,
                     joinText("which rooms, 3,10-19 say; from ", kFirstTrainingSeed,
                              " on with training models"))
+                 .between(0, double(std::numeric_limits<int32_t>::max()))
                  .required(),
              option("-o,--output FOLDER", &o->output,
                     "for SEED.xz; rooms that are there are left alone")
