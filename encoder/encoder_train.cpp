@@ -221,10 +221,10 @@ void train(const EncoderConfig& config, const SceneSource& scenes, int64_t scene
       const MixedPrecision mixed(settings.mixed_precision);
       const Losses l = sceneLosses(*net, condition, targets, random);
       const Tensor total = l.total(config);
-      trainer.addSample(total, {{"loss", total.item<double>()},
-                                {"image", l.image.item<double>()},
-                                {"kl", l.kl.item<double>()},
-                                {"split", l.occupancy.item<double>()}});
+      trainer.addLoss(total, {{"loss", total.item<double>()},
+                              {"image", l.image.item<double>()},
+                              {"kl", l.kl.item<double>()},
+                              {"split", l.occupancy.item<double>()}});
     }
     trainer.update();
     if (trainer.validationDue()) {

@@ -27,6 +27,8 @@ struct TrainSettings {
   std::string work_folder;   // checkpoint, log.csv, validation pictures
   int64_t steps = 4000;
   int64_t batch = 1;  // samples a step, their gradients averaged; a multiple of the processes
+  /// Of the completer: fine samples of each, behind its one coarse sample; they count as one.
+  int64_t fine_draws = 1;
   TrainProcesses processes;
   bool mixed_precision = false;  // matrix products in bfloat16; parameters and sums stay float32
   double learning_rate = 8e-4;   // peak; linear warm-up, then cosine to 2 %

@@ -42,7 +42,7 @@ Trainer::Trainer(std::shared_ptr<torch::nn::Module> net, std::shared_ptr<torch::
   }
 }
 
-void Trainer::addSample(const Tensor& loss, const std::map<std::string, double>& values) {
+void Trainer::addLoss(const Tensor& loss, const std::map<std::string, double>& values) {
   if (loss.requires_grad()) (loss / double(settings_.batch)).backward();
   for (const auto& [name, value] : values) values_[name] += value / double(settings_.batch);
 }

@@ -26,8 +26,9 @@ class Trainer {
   /// batch), and this process's among them:
   int64_t firstSample() const { return step_ * settings_.batch + processes_.rank() * samples(); }
   int64_t samples() const { return settings_.batch / processes_.size(); }
-  /// Adds one sample's share of the gradient of the mean loss, and `values` to the log.
-  void addSample(const Tensor& loss, const std::map<std::string, double>& values);
+  /// Adds a sample's loss, or a part of it: its share of the gradient of the mean loss, and of the
+  /// `values` of the log.
+  void addLoss(const Tensor& loss, const std::map<std::string, double>& values);
   /// One optimiser step from all samples' gradients; skips steps whose gradient is not finite.
   void update();
   bool validationDue() const {

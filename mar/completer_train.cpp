@@ -132,11 +132,12 @@ Tensor occupancyLoss(const Tensor& logits, const Labels& l, const CompleterConfi
                        l.weight.index_select(0, rows), c.focal_gamma, c.focal_alpha);
 }
 
-struct Losses {
-  Tensor coarse, fine, linear, diffusion, refinement;
+// Of one fine sample.
+struct FineLosses {
+  Tensor fine = torch::zeros({}), linear = torch::zeros({}), diffusion = torch::zeros({}),
+         refinement = torch::zeros({});
   Tensor total(const CompleterConfig& c) const {
-    return coarse + fine + linear + c.diffusion_weight * diffusion +
-           c.refinement_weight * refinement;
+    return fine + linear + c.diffusion_weight * diffusion + c.refinement_weight * refinement;
   }
 };
 
@@ -192,49 +193,73 @@ Tensor coarseLoss(CompleterNet& net, const SceneTokens& scene, const CompletionS
                        net.config);
 }
 
-Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& colour_way,
-                    double own_gate, torch::Generator& random) {
+// A sample as a step sees it: through a window, with what lies behind the gate.
+struct DrawnScene {
+  VoxelFrame frame;
+  SceneTokens scene;
+  TargetRows rows;
+  Tensor condition_z, target_z;  // [N, latent_dim] standardised
+  bool own = false;              // the gate is the coarse stage as it is
+  Gate drawn{}, asked{};
+  std::vector<Coord> candidates{};  // of the fine stage
+  Tensor coarse_loss = torch::zeros({});
+
+  const Gate& gate() const { return own ? asked : drawn; }
+};
+
+DrawnScene drawScene(CompleterNet& net, const CompletionSample& s, double own_gate,
+                     torch::Generator& random) {
   const CompleterConfig& c = net.config;
   VoxelFrame frame = s.condition.frame;
   frame.bounds = drawBounds(s, c, random);
-  const SceneTokens scene = sceneTokens(seenIn(s.seen_nodes, nodesIn(frame.bounds, 1)),
-                                        seenIn(s.seen_coarse, nodesIn(frame.bounds, 2)));
+  DrawnScene d{
+      frame,
+      sceneTokens(seenIn(s.seen_nodes, nodesIn(frame.bounds, 1)),
+                  seenIn(s.seen_coarse, nodesIn(frame.bounds, 2))),
+      TargetRows(s),
+      net.standardise(torch::tensor(s.condition.z).view({s.condition.size(), c.latent_dim})),
+      net.standardise(torch::tensor(s.target.z).view({s.target.size(), c.latent_dim}))};
+  const SceneTokens& scene = d.scene;
   const std::vector<Coord> unknown = unobservedNodes(scene.coarse, scene.coarse.box);
-  Gate drawn;
-  Losses l;
-  l.coarse =
-      c.coarse_stage ? coarseLoss(net, scene, s, unknown, frame, random, &drawn) : torch::zeros({});
-  l.fine = l.linear = l.diffusion = l.refinement = torch::zeros({});
+  if (c.coarse_stage) d.coarse_loss = coarseLoss(net, scene, s, unknown, frame, random, &d.drawn);
 
   // The fine stage works inside what the coarse stage keeps, as it is or as a better one would be:
   // all of the truth and what it takes for true.
-  const bool own = !c.coarse_stage || uniform(random) < own_gate;
-  const double tau = own ? CompleteSettings().coarse_tau : uniform(.05, .5, random);
-  Gate asked;
-  if (own) {
+  d.own = !c.coarse_stage || uniform(random) < own_gate;
+  const double tau = d.own ? CompleteSettings().coarse_tau : uniform(.05, .5, random);
+  if (d.own) {
     torch::NoGradGuard no_grad;
-    for (const Coord& node : scene.coarse_filled) asked.set(node, 1);
+    for (const Coord& node : scene.coarse_filled) d.asked.set(node, 1);
     // What a larger window adds is all unseen: none of it is worth the fine stage's time.
     std::vector<Coord> near;
     for (const Coord& node : unknown)
       if (s.seen_coarse.box.isInside(node)) near.push_back(node);
     for (const std::vector<Coord>& chunk : chunksOf(near, c.coarse_chunk_tokens)) {
       const std::vector<float> p = coarseProbability(net, scene, chunk, frame);
-      for (size_t i = 0; i < chunk.size(); ++i) asked.set(chunk[i], p[i]);
+      for (size_t i = 0; i < chunk.size(); ++i) d.asked.set(chunk[i], p[i]);
     }
   }
-  const Gate& gate = own ? asked : drawn;
+  const Gate& gate = d.gate();
   std::vector<Coord> open;
   for (size_t i = 0; i < gate.size(); ++i) {
     const Coord& node = gate.tokens()[i];
-    if (double(gate.values()[i]) > tau || (!own && s.target_coarse.at(node) == NodeState::kFilled))
+    if (double(gate.values()[i]) > tau ||
+        (!d.own && s.target_coarse.at(node) == NodeState::kFilled))
       open.push_back(node);
   }
   std::sort(open.begin(), open.end());
-  const std::vector<Coord> candidates = unobservedChildren(open, scene.nodes);
-  const TargetRows rows(s);
-  if (candidates.empty() || rows.all.empty()) return l;
-  const FineMask m = drawFineMask(candidates, s, c, random);
+  d.candidates = unobservedChildren(open, scene.nodes);
+  return d;
+}
+
+// Of one mask and one chunk of targets behind the gate; 0 where nothing lies behind it.
+FineLosses fineLosses(CompleterNet& net, const CompletionSample& s, const DrawnScene& d,
+                      const Tensor& colour_way, torch::Generator& random) {
+  const CompleterConfig& c = net.config;
+  const TargetRows& rows = d.rows;
+  FineLosses l;
+  if (d.candidates.empty() || rows.all.empty()) return l;
+  const FineMask m = drawFineMask(d.candidates, s, c, random);
   const std::vector<Coord>& around = m.frontier.empty() ? m.others : m.frontier;
   if (around.empty()) return l;
 
@@ -253,7 +278,7 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
   std::vector<Coord> context = s.condition.ijk;
   context.insert(context.end(), m.visible.begin(), m.visible.end());
   context.insert(context.end(), m.false_visible.begin(), m.false_visible.end());
-  FineChunk chunk = fineChunk(scene, gate, context, s.condition.size(), targets, centre,
+  FineChunk chunk = fineChunk(d.scene, d.gate(), context, s.condition.size(), targets, centre,
                               c.context_tokens, c.empty_tokens);
   TokenSets& in = chunk.tokens;
   // A wrong token carries some true token's latent: plausible content in a wrong place.
@@ -262,16 +287,13 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
     const int64_t own_row = rows.find(token);
     visible_rows.push_back(own_row >= 0 ? own_row : anyRow());
   }
-  const Tensor condition_z =
-      net.standardise(torch::tensor(s.condition.z).view({s.condition.size(), -1}));
-  const Tensor target_z = net.standardise(torch::tensor(s.target.z).view({s.target.size(), -1}));
   in[kCondition].features =
-      condition_z.index_select(0, torch::tensor(chunk.rows[kCondition], torch::kInt64));
-  in[kVisible].features = target_z.index_select(0, torch::tensor(visible_rows, torch::kInt64));
+      d.condition_z.index_select(0, torch::tensor(chunk.rows[kCondition], torch::kInt64));
+  in[kVisible].features = d.target_z.index_select(0, torch::tensor(visible_rows, torch::kInt64));
   in[kVisible].features =
       in[kVisible].features +
       uniform(0, c.context_noise, random) * torch::randn(in[kVisible].features.sizes(), random);
-  const CompleterNet::Fine f = net.fine(in, frame);
+  const CompleterNet::Fine f = net.fine(in, d.frame);
   l.fine = occupancyLoss(f.logits, labelsOf(targets, s.target_nodes, c.unobserved_weight), c);
 
   const SnrWeight weight = c.paper_snr_weight ? SnrWeight::kSnr : SnrWeight::kInverse;
@@ -284,7 +306,7 @@ Losses sampleLosses(CompleterNet& net, const CompletionSample& s, const Tensor& 
     }
     if (token_rows.empty()) return DiffusionHead::Loss{torch::zeros({}), torch::zeros({})};
     return head.loss(tokens.index_select(0, torch::tensor(token_rows)),
-                     target_z.index_select(0, torch::tensor(target_rows)), colour_way,
+                     d.target_z.index_select(0, torch::tensor(target_rows)), colour_way,
                      c.diffusion_draws, weight, random);
   };
   const auto latent = latentLoss(*net.diffusion, f.targets, targets);
@@ -332,7 +354,7 @@ std::map<std::string, double> validate(const std::string& weights,
     const Place whole = completer.complete(s.condition, settings, silent);
     double hit = 0, filled = 0, truth = 0, known = 0, squared = 0, matched = 0;
     for (const Coord& node : filledNodes(s.target_nodes))
-      truth += s.seen_nodes.at(node) == NodeState::kUnobserved;
+      truth += s.seen_nodes.box.isInside(node) && s.seen_nodes.at(node) == NodeState::kUnobserved;
     const TargetRows rows(s);
     for (int64_t k = s.condition.size(); k < whole.size(); ++k) {
       const NodeState state = s.target_nodes.at(whole.ijk[size_t(k)]);
@@ -411,14 +433,22 @@ void train(const CompleterConfig& config, const std::vector<float>& colour_way,
       torch::Generator random =
           at::detail::createCPUGenerator(settings.seed * 1000003 + uint64_t(first) + k);
       const MixedPrecision mixed(settings.mixed_precision);
-      const Losses l = sampleLosses(*net, current[k], colours, own_gate, random);
-      const Tensor total = l.total(config);
-      trainer.addSample(total, {{"loss", total.item<double>()},
-                                {"coarse", l.coarse.item<double>()},
-                                {"fine", l.fine.item<double>()},
-                                {"linear", l.linear.item<double>()},
-                                {"diffusion", l.diffusion.item<double>()},
-                                {"refinement", l.refinement.item<double>()}});
+      const DrawnScene scene = drawScene(*net, current[k], own_gate, random);
+      const double coarse = scene.coarse_loss.item<double>();
+      trainer.addLoss(scene.coarse_loss, {{"loss", coarse}, {"coarse", coarse}});
+      // One after the other: a sample's graph is gone before the next one is made.
+      for (int64_t draw = 0; draw < settings.fine_draws; ++draw) {
+        const FineLosses l = fineLosses(*net, current[k], scene, colours, random);
+        const Tensor total = l.total(config) / double(settings.fine_draws);
+        const auto logged = [&](const Tensor& loss) {
+          return loss.item<double>() / double(settings.fine_draws);
+        };
+        trainer.addLoss(total, {{"loss", total.item<double>()},
+                                {"fine", logged(l.fine)},
+                                {"linear", logged(l.linear)},
+                                {"diffusion", logged(l.diffusion)},
+                                {"refinement", logged(l.refinement)}});
+      }
     }
     trainer.update();
     if (trainer.validationDue()) {
@@ -460,14 +490,16 @@ CompleterStep completerStep(const CompleterConfig& config, const CompletionSampl
   for (double* loss : {&result.before, &result.after}) {
     optimiser.zero_grad();
     torch::Generator random = at::detail::createCPUGenerator(seed);
-    const Losses l = sampleLosses(*net, sample, colours, double(config.own_gate_share), random);
-    *loss = l.total(config).item<double>();
+    const DrawnScene scene = drawScene(*net, sample, double(config.own_gate_share), random);
+    const FineLosses l = fineLosses(*net, sample, scene, colours, random);
+    const Tensor total = scene.coarse_loss + l.total(config);
+    *loss = total.item<double>();
     if (loss == &result.before && l.refinement.requires_grad()) {
       l.refinement.backward({}, true);
       result.trunk_gradient_of_refinement = gradientSum(*net->trunk);
       optimiser.zero_grad();
     }
-    l.total(config).backward();
+    total.backward();
     if (loss == &result.before) result.gradient_sum = gradientSum(*net);
     optimiser.step();
   }

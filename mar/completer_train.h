@@ -23,13 +23,15 @@ CompletionSample readSample(const std::string& path);
 
 using SampleSource = std::function<CompletionSample(uint64_t index)>;
 
-/// Trains both stages (or resumes). Each step: one sample. Coarse: a random share (.3-1) of the
-/// unknown coarse positions is worked on, a random part of the truth may be visible. Fine: three
-/// quarters of the masks show condition tokens alone and ask about one BFS level, the rest are
-/// growth states or hide a random .5-1 of the truth; visible tokens get noise and false positives
-/// as roll-outs have them. Errors of latents count twice: of all channels, and of what `colour_way`
-/// ([K, latent_dim] by rows, Encoder::colourWay()) makes of them. Validation by roll-outs:
-/// precision, recall and F1 on unobserved level-1 nodes against the dense views' truth.
+/// Trains both stages (or resumes). Each step: the mean gradient of settings.batch samples, each a
+/// coarse sample and the mean of settings.fine_draws fine ones behind it. Coarse: a random share
+/// (.3-1) of the unknown coarse positions is worked on, a random part of the truth may be visible.
+/// Fine: three quarters of the masks show condition tokens alone and ask about one BFS level, the
+/// rest are growth states or hide a random .5-1 of the truth; visible tokens get noise and false
+/// positives as roll-outs have them. Errors of latents count twice: of all channels, and of what
+/// `colour_way` ([K, latent_dim] by rows, Encoder::colourWay()) makes of them. Validation by
+/// roll-outs: precision, recall and F1 on unobserved level-1 nodes of the condition's box against
+/// the dense views' truth.
 void trainCompleter(const CompleterConfig& config, const std::vector<float>& colour_way,
                     const SampleSource& samples, int64_t sample_count,
                     const SampleSource& validation, int validation_count,

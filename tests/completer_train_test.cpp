@@ -214,6 +214,58 @@ TEST_F(CompleterResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // section 
                Error);
 }
 
+TEST_F(CompleterResume, AnInterruptedRunInBatchesEndsAsAnUninterruptedOne) {  // section 5.5
+  const SampleSource samples = [](uint64_t index) { return toySample(3 + int(index)); };
+  TrainSettings settings;
+  settings.steps = 4, settings.batch = 2, settings.fine_draws = 3;
+  settings.validate_every = settings.checkpoint_every = 2;
+  const auto train = [&](const std::string& name, bool resume, Progress& progress) {
+    settings.weights_path = path(name + ".safetensors"), settings.work_folder = path(name);
+    settings.resume = resume;
+    trainCompleter(toyConfig(), kOneColour, samples, 4, samples, 0, settings, nullptr, progress);
+  };
+  Progress silent;
+  StopAtHalf stop;
+  train("whole", false, silent);
+  EXPECT_THROW(train("parts", false, stop), Cancelled);
+  train("parts", true, silent);
+  for (const char* file : {".safetensors", "/checkpoint.safetensors", "/log.csv"})
+    EXPECT_TRUE(bytesOf(path("parts") + file) == bytesOf(path("whole") + file)) << file;
+}
+
+TEST_F(CompleterResume, ABatchHasTheMeanGradientOfItsSamples) {  // section 5.5
+  CompleterConfig c = toyConfig();
+  c.own_gate_share = 0;
+  const SampleSource samples = [](uint64_t index) { return toySample(3 + int(index)); };
+  TrainSettings settings;
+  settings.learning_rate = 0, settings.clip_norm = 1e9;  // the network stays as it is
+  Progress silent;
+  // AdamW's first moment of every parameter: .1 of the gradient, and .9 of what it was before.
+  const auto moments = [&](const std::string& name, int64_t steps, int64_t batch) {
+    settings.steps = steps, settings.batch = batch;
+    settings.weights_path = path(name + ".safetensors"), settings.work_folder = path(name);
+    trainCompleter(c, kOneColour, samples, 2, samples, 0, settings, nullptr, silent);
+    std::map<std::string, Tensor> first;
+    for (const auto& [key, tensor] : readTensors(path(name + "/checkpoint.safetensors")).tensors)
+      if (key.rfind("first.", 0) == 0) first[key] = tensor;
+    return first;
+  };
+  const auto both = moments("both", 1, 2), one = moments("one", 1, 1), two = moments("two", 2, 1);
+  ASSERT_GT(both.size(), 20u);
+  double largest = 0;
+  for (const auto& [name, moment] : both) {
+    const auto of = [&](const auto& moments) {
+      return moments.count(name) ? moments.at(name) : torch::zeros_like(moment);
+    };
+    const Tensor first = of(one), second = of(two) - .9 * of(one);
+    EXPECT_LT(largestDifference(moment, (first + second) / 2),
+              1e-6 + 1e-4 * moment.abs().max().item<double>())
+        << name;
+    largest = std::max(largest, largestDifference(first, second));
+  }
+  EXPECT_GT(largest, 1e-3);  // the samples differ
+}
+
 TEST_F(CompleterResume, ATrainingCanStartFromGivenWeights) {
   CompleterConfig c = toyConfig();
   const SampleSource samples = [](uint64_t index) { return toySample(3 + int(index)); };

@@ -30,12 +30,16 @@ TEST_F(Lab, UsageErrorsExitWith2) {
     expectFailure({"make_rooms", "rooms", "-o", output_ + "/rooms", "--seeds", seeds}, kUsage,
                   seeds);
   expectFailure({"make_rooms", "homes", "-o", output_ + "/homes", "--size", "4"}, kUsage, "--size");
+  expectFailure({"pack", "-o", output_ + "/packed"}, kUsage, "--seeds");
+  expectFailure({"train", "mar", "-o", at("w.safetensors"), "--encoder", "e.safetensors",
+                 "--packed", at("packed"), "--rooms", "3"},
+                kUsage, "--rooms");
 }
 
 TEST_F(Lab, HelpListsEveryVerb) {
   const Ended front = run({"--help"});
   EXPECT_EQ(front.code, kOk);
-  for (const char* verb : {"train encoder", "train mar", "eval", "tables", "compare",
+  for (const char* verb : {"train encoder", "train mar", "pack", "eval", "tables", "compare",
                            "make_rooms rooms", "make_rooms homes", "make_rooms models",
                            "make_rooms statistics", "make_rooms attribution", "make_rooms table"})
     EXPECT_NE(front.out.find(std::string("\n  ") + verb + " "), std::string::npos) << verb;
@@ -136,6 +140,28 @@ TEST_F(Lab, TrainingRefusesAStartThatIsNoCompleterBeforeAnyWork) {
                   kFailed, from);
     EXPECT_FALSE(fs::exists(at("new.safetensors.work")));
   }
+}
+
+TEST_F(Lab, PackedRoomsAreTheSameOnAnyNumberOfThreadsAndAreLeftAlone) {
+  NEEDS_WEIGHTS();
+  if (!AssetLibrary::isInstalled()) GTEST_SKIP() << "sweethome3d is not installed";
+  const std::string room = "1000001";
+  for (const std::string threads : {"1", "2"}) {
+    const std::string folder = at("packed" + threads);
+    const Args args = {"pack",      "--seeds",    room,        "-o",    folder,
+                       "--weights", VDBC_WEIGHTS, "--threads", threads, "--json"};
+    const Ended ended = run(args);
+    ASSERT_EQ(ended.code, kOk) << ended.err;
+    const json result = json::parse(ended.out);
+    EXPECT_EQ(result.at("room"), 1000001);
+    EXPECT_EQ(result.at("conditions"), 7);
+    EXPECT_EQ(result.at("bytes"), fs::file_size(folder + "/" + room + ".xz"));
+    EXPECT_LT(result.at("bytes"), 200000);
+    EXPECT_EQ(run(args).out, "");  // it is there
+  }
+  for (const char* file : {".xz", ".surfaces.xz"})
+    EXPECT_TRUE(readText(at("packed1/" + room + file)) == readText(at("packed2/" + room + file)))
+        << file;
 }
 
 TEST_F(Lab, EvalReconstructRefusesOptionsOfTheCompletion) {

@@ -185,8 +185,8 @@ Verb evalVerb() {
 Program vdbLab() {
   Program lab{"vdb_lab",
               "Furnished rooms, training and studies of vdb_complete.",
-              {trainEncoderVerb(), trainMarVerb(), calibrateVerb(), evalVerb(), tablesVerb(),
-               compareVerb()}};
+              {trainEncoderVerb(), trainMarVerb(), packVerb(), calibrateVerb(), evalVerb(),
+               tablesVerb(), compareVerb()}};
   for (Verb& v : makeRoomsVerbs()) lab.verbs.push_back(std::move(v));
   return lab;
 }

@@ -7,6 +7,7 @@ namespace vdbc {
 Verb evalVerb();          // verbs_lab.cpp
 Verb trainEncoderVerb();  // verbs_train.cpp
 Verb trainMarVerb();
+Verb packVerb();       // verbs_pack.cpp
 Verb calibrateVerb();  // verbs_calibrate.cpp
 Verb tablesVerb();     // verbs_tables.cpp
 Verb compareVerb();

@@ -7,6 +7,7 @@
 #include <nlohmann/json.hpp>
 
 #include "encoder/encoder_train.h"
+#include "examples/lab/packed_room.h"
 #include "examples/lab/scenes.h"
 #include "examples/lab/verbs_lab.h"
 #include "houdini_style_tools/complete.h"
@@ -16,9 +17,12 @@ namespace {
 
 using nlohmann::ordered_json;
 
+// With packed rooms, which are read faster than a step is worked out: scenes and fine samples.
+constexpr int64_t kPackedBatch = 4, kPackedFineDraws = 6;
+
 struct TrainOptions {
   TrainSettings settings;
-  std::string cache, preset = "small", encoder;
+  std::string cache, preset = "small", encoder, packed;
   std::vector<std::string> changes;  // NAME=VALUE
   int64_t rooms = 0;
 };
@@ -114,8 +118,50 @@ void cookTrainEncoder(const TrainOptions& o, const Run& run, Progress& progress)
                trainListener(run.json), progress);
 }
 
-void cookTrainMar(const TrainOptions& o, const Run& run, Progress& progress) {
+// What the completer is trained on.
+struct TrainingSamples {
+  SampleSource source;
+  int64_t count = 0;
+  std::string rooms;  // rooms:SEED-SEED
+};
+
+TrainingSamples samplesOfPackedRooms(const std::string& folder, const Encoder& encoder) {
+  const PackedSamples packed = packedSamples(folder, encoder.hash());
+  const uint64_t first = packed.seeds.front(), last = packed.seeds.back();
+  require(first >= kTrainingSeed && last < kTrainingSeed + kReservedSeeds, folder,
+          ": expected rooms for training, ", kTrainingSeed, "-", kTrainingSeed + kReservedSeeds - 1,
+          ", found ", first, "-", last);
+  return {packed.source, packed.count, joinText("rooms:", first, "-", last)};
+}
+
+// Samples of rooms by seed, kept in `folder`.
+SampleSource roomSamples(const Encoder& encoder, uint64_t first, int64_t rooms,
+                         const std::string& cache, const std::string& folder) {
+  return [&encoder, first, rooms, cache, folder](uint64_t i) {
+    return completionSample(encoder, first + i % uint64_t(rooms), int(i / uint64_t(rooms)), cache,
+                            folder);
+  };
+}
+
+// Encoded now, so that training does not wait for it.
+TrainingSamples samplesOfRooms(const Encoder& encoder, int64_t rooms, const std::string& cache,
+                               const std::string& folder, Progress& progress) {
+  const TrainingSamples s{roomSamples(encoder, kTrainingSeed, rooms, cache, folder),
+                          rooms * kSamplesPerRoom, seedRange(kTrainingSeed, rooms)};
+  progress.start("encode rooms");
+  for (int64_t i = 0; i < s.count; ++i) {
+    s.source(uint64_t(i));
+    report(progress, int(100 * i / s.count));
+  }
+  progress.end();
+  return s;
+}
+
+void cookTrainMar(TrainOptions o, const Run& run, Progress& progress) {
   constexpr int kValidationRooms = 8;
+  const bool packed = !o.packed.empty();
+  if (packed && !run.isGiven("--batch")) o.settings.batch = kPackedBatch;
+  if (packed && !run.isGiven("--fine")) o.settings.fine_draws = kPackedFineDraws;
   const Encoder encoder(o.encoder);
   // Refused now, not after the rooms are encoded.
   if (!o.settings.from.empty()) Completer{o.settings.from};
@@ -126,27 +172,17 @@ void cookTrainMar(const TrainOptions& o, const Run& run, Progress& progress) {
   s.metadata["encoder_hash"] = encoder.hash();
   s.validate_every = 1000;  // roll-outs take seconds each
   // Samples depend on the encoder: its hash names their folder.
-  const std::string samples = s.work_folder + "/samples_" + encoder.hash();
-  auto source = [&](uint64_t first, int64_t rooms) {
-    return [&, first, rooms](uint64_t i) {
-      return completionSample(encoder, first + i % uint64_t(rooms), int(i / uint64_t(rooms)),
-                              o.cache, samples);
-    };
-  };
-  const auto training = source(kTrainingSeed, o.rooms),
-             validation = source(kValidationSeed, kValidationRooms);
-  const int64_t count = o.rooms * kSamplesPerRoom;
-  progress.start("encode rooms");
-  for (int64_t i = 0; i < count; ++i) {
-    training(uint64_t(i));
-    report(progress, int(100 * i / count));
-  }
-  progress.end();
-  trainCompleter(config, encoder.colourWay(), training, count, validation, kValidationRooms, s,
-                 trainListener(run.json), progress);
+  const std::string folder = s.work_folder + "/samples_" + encoder.hash();
+  const TrainingSamples training =
+      packed ? samplesOfPackedRooms(o.packed, encoder)
+             : samplesOfRooms(encoder, o.rooms, o.cache, folder, progress);
+  s.metadata["trained_on"] = training.rooms;
+  trainCompleter(config, encoder.colourWay(), training.source, training.count,
+                 roomSamples(encoder, kValidationSeed, kValidationRooms, o.cache, folder),
+                 kValidationRooms, s, trainListener(run.json), progress);
 }
 
-std::vector<Option> trainOptions(TrainOptions* o) {
+std::vector<Option> trainOptions(TrainOptions* o, const std::string& batch) {
   TrainSettings* s = &o->settings;
   return {
       option("-o,--output FILE", &s->weights_path, "weights to write (.safetensors)").required(),
@@ -154,7 +190,7 @@ std::vector<Option> trainOptions(TrainOptions* o) {
       option("--rooms N", &o->rooms, "furnished rooms to train on")
           .between(1, double(kReservedSeeds)),
       option("--rate R", &s->learning_rate, "peak learning rate").between(0, 1),
-      option("--batch N", &s->batch, "samples a step").between(1, 1 << 20),
+      option("--batch N", &s->batch, "samples a step").between(1, 1 << 20).otherwise(batch),
       option("--preset NAME", &o->preset, "small or paper").oneOf({"small", "paper"}),
       option("--set NAME=VALUE", &o->changes, "changes a size of the preset; may come again"),
       option("--work FOLDER", &s->work_folder, "for checkpoint, log and pictures")
@@ -174,14 +210,22 @@ Verb trainEncoderVerb() {
   return {"train encoder",
           "trains the encoder-decoder on furnished rooms",
           "-o out/encoder.safetensors --cache out/rooms",
-          {{"", trainOptions(o.get())}},
+          {{"", trainOptions(o.get(), "1")}},
           [o](const Run& run, Progress& progress) { cookTrainEncoder(*o, run, progress); }};
 }
 
 Verb trainMarVerb() {
   const auto o = std::make_shared<TrainOptions>();
   o->settings.steps = 8000, o->settings.learning_rate = 8e-4, o->rooms = 400;
-  std::vector<Option> options = trainOptions(o.get());
+  std::vector<Option> options =
+      trainOptions(o.get(), joinText("1; ", kPackedBatch, " with --packed"));
+  options.push_back(option("--fine N", &o->settings.fine_draws,
+                           "fine samples of each, behind its one coarse sample")
+                        .between(1, 1 << 20)
+                        .otherwise(joinText("1; ", kPackedFineDraws, " with --packed")));
+  options.push_back(option("--packed FOLDER", &o->packed, "of rooms from pack, all of them")
+                        .otherwise("rooms are rendered and encoded")
+                        .excludes({"--rooms"}));
   options.push_back(option("--encoder FILE", &o->encoder, "encoder weights").required());
   options.push_back(option("--from FILE", &o->settings.from, "completer weights to start from")
                         .otherwise("random ones")
