@@ -31,6 +31,7 @@ TEST_F(Lab, UsageErrorsExitWith2) {
                   seeds);
   expectFailure({"make_rooms", "homes", "-o", output_ + "/homes", "--size", "4"}, kUsage, "--size");
   expectFailure({"pack", "-o", output_ + "/packed"}, kUsage, "--seeds");
+  expectFailure({"pack", "-o", output_ + "/packed", "--seeds", "2147483648"}, kUsage, "--seeds");
   expectFailure({"train", "mar", "-o", at("w.safetensors"), "--encoder", "e.safetensors",
                  "--packed", at("packed"), "--rooms", "3"},
                 kUsage, "--rooms");

@@ -116,6 +116,10 @@ std::optional<Packed> tryPackRoom(uint64_t seed, const Encoder& encoder, Progres
 }
 
 void cookPack(const PackOptions& o, const Run& run, Progress& progress) {
+  constexpr uint64_t kMaxSeed = std::numeric_limits<int32_t>::max();  // as files hold them
+  for (const uint64_t seed : o.seeds)
+    if (seed > kMaxSeed)
+      throw UsageError(joinText("--seeds: expected at most ", kMaxSeed, ", found ", seed));
   const Encoder encoder(weightsFolder(o.weights) + "/encoder.safetensors");
   roomAssets();  // refused now where they are missing, not room by room
   startPackedFolder(o.output, encoder.hash());
@@ -150,7 +154,6 @@ Verb packVerb() {
             {ranges("--seeds LIST", &o->seeds,
                     joinText("which rooms, 3,10-19 say; from ", kFirstTrainingSeed,
                              " on with training models"))
-                 .between(0, double(std::numeric_limits<int32_t>::max()))
                  .required(),
              option("-o,--output FOLDER", &o->output,
                     "for SEED.xz; rooms that are there are left alone")
