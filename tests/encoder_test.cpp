@@ -1188,7 +1188,7 @@ TEST_F(EncoderResume, ABatchesGradientIsTheMeanOfItsSamples) {  // section 3.7
   settings.batch = 2, settings.work_folder = path("mean");
   Trainer trainer(net, average, "toy", "{}", settings, nullptr);
   const Tensor x = torch::randn({2, 3});
-  for (int i = 0; i < 2; ++i) trainer.addSample((i + 1) * net->forward(x[i]).sum(), {});
+  for (int i = 0; i < 2; ++i) trainer.addLoss((i + 1) * net->forward(x[i]).sum(), {});
   EXPECT_TRUE(torch::allclose(net->weight.grad(), ((x[0] + 2 * x[1]) / 2).unsqueeze(0)));
 }
 
