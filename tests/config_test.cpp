@@ -126,7 +126,7 @@ TEST(ShippedWeights, AreWhatTheyWere) {
   EXPECT_EQ(encoder.hash(), "f7fa8a83edff251c");
   expectFileOrDefault(encoder.config(), metadataOf(encoder_path)["encoder"]);
   const Completer completer(completer_path);
-  EXPECT_EQ(completer.hash(), "74ff05c1bcdf43e7");
+  EXPECT_EQ(completer.hash(), "e9d276e82057244a");
   expectFileOrDefault(completer.config(), metadataOf(completer_path)["completer"]);
 }
 
