@@ -73,9 +73,9 @@ Option fromLevelOption(CompleteSettings* settings) {
 std::vector<Option> growthOptions(CompleteSettings* s) {
   return {
       option("--coarse-tau P", &s->coarse_tau, "like --tau, for the coarse gate").between(0, 1),
-      option(
-          "--hole-tau P", &s->hole_tau,
-          "above this probability dropped tokens are taken back where they close a hole; 1: none")
+      option("--hole-tau P", &s->hole_tau,
+             "above this probability dropped tokens are taken back where they close a small hole; "
+             "1: none")
           .between(0, 1),
       option("--sampling-steps N", &s->sampling_steps, "diffusion steps; 0: the linear mean")
           .between(0, 1000),

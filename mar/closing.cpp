@@ -12,7 +12,8 @@
 namespace vdbc {
 namespace {
 
-constexpr int kClosedLevel = 1;  // tokens are nodes of 2^3 voxels
+constexpr int kClosedLevel = 1;      // tokens are nodes of 2^3 voxels
+constexpr size_t kLargestHole = 12;  // tokens: half a square metre
 
 using Traits = boost::adjacency_list_traits<boost::vecS, boost::vecS, boost::directedS>;
 using Edge = Traits::edge_descriptor;
@@ -133,6 +134,30 @@ class StandingRoom {
   std::vector<Eigen::Vector3d> lenses_;
 };
 
+// Those of `rows` that close small holes, in their order: parts of neighbours of at most
+// kLargestHole tokens. A larger sheet is a guess at a whole wall, not the mending of one.
+std::vector<int64_t> smallHoles(const Place& dropped, const std::vector<int64_t>& rows) {
+  TokenMap<size_t> numbers;
+  for (size_t i = 0; i < rows.size(); ++i) numbers.insert(dropped.ijk[size_t(rows[i])], i);
+  std::vector<uint8_t> visited(rows.size(), 0), small(rows.size(), 0);
+  for (size_t first = 0; first < rows.size(); ++first) {
+    if (visited[first]) continue;
+    std::vector<size_t> part{first};
+    visited[first] = 1;
+    for (size_t k = 0; k < part.size(); ++k)
+      for (const Coord& next : neighbourRing({dropped.ijk[size_t(rows[part[k]])]}))
+        if (const size_t* i = numbers.find(next); i && !visited[*i]) {
+          visited[*i] = 1;
+          part.push_back(*i);
+        }
+    for (size_t i : part) small[i] = part.size() <= kLargestHole;
+  }
+  std::vector<int64_t> result;
+  for (size_t i = 0; i < rows.size(); ++i)
+    if (small[i]) result.push_back(rows[i]);
+  return result;
+}
+
 }  // namespace
 
 std::vector<int64_t> closingTokens(const SeenSpace& nodes, const std::vector<Coord>& occupied,
@@ -205,7 +230,7 @@ std::vector<int64_t> closingTokens(const SeenSpace& nodes, const std::vector<Coo
     const bool cut = graph[in].colour == source_colour && graph[in + 1].colour != source_colour;
     if (cut && dropped.probability[size_t(row)] > least) closing.push_back(row);
   }
-  return closing;
+  return smallHoles(dropped, closing);
 }
 
 }  // namespace vdbc

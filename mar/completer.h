@@ -14,9 +14,9 @@ namespace vdbc {
 struct CompleteSettings {
   float tau = .5f;         // a token is kept if its occupancy probability exceeds this
   float coarse_tau = .1f;  // the coarse stage's gate: high recall
-  /// Dropped tokens above this probability are taken back where they close a hole (a minimum cut
-  /// between what was seen empty and the border of the volume); 1: none.
-  float hole_tau = 1;
+  /// Dropped tokens above this probability are taken back where they close a small hole (a minimum
+  /// cut between what was seen empty and the border of the volume); 1: none.
+  float hole_tau = .1f;
   Neighbours neighbours = Neighbours::kCorners26;
   int sampling_steps = 0;  // DDIM steps of the diffusion head; 0: its linear mean
   double temperature = 1;

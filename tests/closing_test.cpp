@@ -347,6 +347,30 @@ TEST(ClosingTokens, OnlyUnobservedTokensOfTheVolumeCanClose) {
   EXPECT_EQ(closed(scene, 0), std::set<Coord>{Coord(2, 2, 1)});
 }
 
+TEST(ClosingTokens, ALargeHoleStaysOpen) {
+  // A box of walls without one of them: 4 x 3 tokens close it, 4 x 4 are too many.
+  for (int height : {3, 4}) {
+    SeenSpace nodes;
+    nodes.level = 1, nodes.box = CoordBBox(Coord(0), Coord(9));
+    std::vector<Coord> walls;
+    Place dropped;
+    for (const Coord& c : nodesOf(CoordBBox(Coord(1), Coord(6, 6, 2 + height)))) {
+      const bool inside =
+          c.x() > 1 && c.x() < 6 && c.y() > 1 && c.y() < 6 && c.z() > 1 && c.z() < 2 + height;
+      const bool missing = c.x() == 6 && c.y() > 1 && c.y() < 6 && c.z() > 1 && c.z() < 2 + height;
+      if (missing)
+        dropped.ijk.push_back(c), dropped.probability.push_back(.4f);
+      else if (inside)
+        nodes.empty.setValueOn(c);
+      else
+        walls.push_back(c);
+    }
+    dropped.bfs_level.assign(dropped.ijk.size(), 1);
+    dropped.generated.assign(dropped.ijk.size(), 1);
+    EXPECT_EQ(closingTokens(nodes, walls, dropped, .1f).size(), height == 3 ? 12u : 0u);
+  }
+}
+
 TEST(ClosingTokens, NothingClosesWherePeopleStand) {
   // A corridor along x that ends in the open, seen in its middle: doors at its end and, likelier,
   // behind the camera.
