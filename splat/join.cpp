@@ -49,9 +49,11 @@ constexpr float kOtherThing = .3f;  // display sRGB
 constexpr float kLeak = .05f;  // of a difference in colour on its way from voxel to voxel: a metre
 constexpr int kRounds = 60;
 
-constexpr int kRimParts = 2;  // along both sides of a flat disc that meets what was seen
-constexpr float kWiden = 1.4f, kLeastOpacity = .95f;  // of a voxel's Gaussian
-constexpr float kTileSigmas = 2.6f;                   // by which tiles are widened to close up
+constexpr int kRimParts = 2;           // along both sides of a flat disc that meets what was seen
+constexpr float kRimOverlap = 1.25f;   // of these
+constexpr float kFill = .6f;           // of how neighbours lie, added to a voxel's Gaussian
+constexpr float kLeastOpacity = .95f;  // of it
+constexpr float kTileSigmas = 2.6f;    // by which tiles are widened to close up
 
 Matrix3f axesOf(const Eigen::Vector4f& q) {
   return Eigen::Quaternionf(q[0], q[1], q[2], q[3]).normalized().toRotationMatrix();
@@ -402,10 +404,11 @@ void fitColours(const Gaussians& discs, const PointCells& disc_cells, float voxe
 }
 
 // As it is drawn: a flat disc a little behind what was seen of the plane that it continues, or else
-// wider than the decoder's Gaussians, which leave gaps between voxels.
+// wider towards its neighbours: the decoder's Gaussians leave gaps between voxels.
 Blob drawn(const Voxel& v, float voxel_m) {
   if (!v.plane) {
-    Blob b = scaled(v.blob, kWiden);
+    Blob b = v.blob;
+    b.covariance += kFill * v.spread;
     b.opacity = std::max(b.opacity, kLeastOpacity);
     return b;
   }
@@ -425,7 +428,7 @@ std::vector<Blob> rimParts(const Blob& disc, const Matrix3f& axes, float voxel_m
   const auto offset = [&](int i) { return (float(i) + .5f) / kRimParts - .5f; };
   for (int i = 0; i < kRimParts; ++i)
     for (int j = 0; j < kRimParts; ++j) {
-      parts.push_back(scaled(disc, 1.f / kRimParts));
+      parts.push_back(scaled(disc, kRimOverlap / kRimParts));
       parts.back().mean += voxel_m * (offset(i) * axes.col(0) + offset(j) * axes.col(1));
     }
   return parts;
