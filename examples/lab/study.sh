@@ -1,18 +1,20 @@
 #!/bin/sh
-# The completer's study: every method on held-out rooms with 1 to 12 views in, and on example homes; charts against the
-# number of views (bars: standard error over the same rooms), the reliability of the stored probabilities, tau against the
-# number of views, and tables. Can be stopped and started again: finished parts stay; delete their .jsonl after the weights
-# have changed. One thread, well over an hour. The charts need gnuplot.
-#   sh examples/lab/study.sh [FOLDER, default docs: writes completion.svg, tau.svg, and results/completion.md,
-#   completion.csv, reliability.csv, completion-*.jsonl]
-# ROOMS (1-16, with several tau), MORE_ROOMS (17-64) and HOMES (0-23, at two views) choose other scenes, VIEWS other numbers
-# of views. PARTS="rooms:1-16/2 ..." makes just those parts, so that several processes can share the work; CHARTS_ONLY=1
-# makes none: charts and tables of what is there.
+# The completer's study: every method on held-out rooms with 1 to 12 views in, on example homes and on real captures; charts
+# against the number of views (bars: standard error over the same rooms), the reliability of the stored probabilities, and
+# tables. Can be stopped and started again: finished parts stay; delete their .jsonl after the weights have changed. One
+# thread, about an hour. The charts need gnuplot.
+#   sh examples/lab/study.sh [FOLDER, default docs: writes completion.svg, and results/completion.md, completion.csv,
+#   reliability.csv, completion-*.jsonl]
+# ROOMS (1-8, with all numbers of views), MORE_ROOMS (9-32) and HOMES (0-7, at two views) choose other scenes, VIEWS other
+# numbers of views, DATA the folder of the captures. TAUS=".3 .4 .5 .6 .7" completes ROOMS with these thresholds too and
+# draws tau.svg. PARTS="rooms:1-8/2 ..." makes just those parts, so that several processes can share the work;
+# CHARTS_ONLY=1 makes none: charts and tables of what is there.
 . "$(dirname -- "$0")/common.sh"
 charts=${1:-$root/docs}
-views="${VIEWS:-1 2 4 8 12}"
-taus=".1 .2 .3 .4 .5 .6"
-some=rooms:${ROOMS:-1-16} more=rooms:${MORE_ROOMS:-17-64} all_homes=homes:${HOMES:-0-23}
+views="${VIEWS:-1 2 4 12}"
+taus=${TAUS:-}
+some=rooms:${ROOMS:-1-8} more=rooms:${MORE_ROOMS:-9-32} all_homes=homes:${HOMES:-0-7}
+data=${DATA:-$root/../shared/data}
 scratch "$charts/results"
 results=$folder
 scratch "$root/out/study"
@@ -25,10 +27,19 @@ part() {
   if [ -s "$(fileOf "$1" "$2")" ]; then return; fi
   echo "$1, $2 views" >&2
   sweep=
-  [ "$1" = "$some" ] && sweep="--taus $taus"
+  [ "$1" = "$some" ] && sweep=${taus:+--taus $taus}
   # shellcheck disable=SC2086  # one word each
   "$lab" eval --scenes "$1" --views "$2" --threads 1 $sweep --json 2>>"$folder/eval.log" >"$folder/part-$$.jsonl"
   mv "$folder/part-$$.jsonl" "$(fileOf "$1" "$2")"
+}
+
+# capture NAME FRAMES: judged by its other frames.
+capture() {
+  file=$results/completion-$1.jsonl
+  if [ -s "$file" ] || [ ! -d "$data/rgbd_$1" ]; then return; fi
+  echo "$1, frames $2" >&2
+  "$lab" eval --scenes "$data/rgbd_$1" --frames "$2" --threads 1 --json 2>>"$folder/eval.log" >"$folder/part-$$.jsonl"
+  mv "$folder/part-$$.jsonl" "$file"
 }
 
 if [ -n "${PARTS:-}" ]; then
@@ -36,19 +47,33 @@ if [ -n "${PARTS:-}" ]; then
   exit
 fi
 if [ -z "${CHARTS_ONLY:-}" ]; then
-  for n in 2 $views; do part "$some" "$n"; part "$more" "$n"; done
+  for n in 2 $views; do part "$some" "$n"; done
+  part "$more" 2
   part "$all_homes" 2
+  capture redkitchen 0,6,12,18
+  capture diningroom 0,2,4
+  capture livingroom_rendered 0,2,4
 fi
 
 # The files there are: two views first, then the homes, then other numbers of views.
 set --
-for part in "$some/2" "$more/2" "$all_homes/2" $(for n in $views; do [ "$n" = 2 ] || echo "$some/$n" "$more/$n"; done); do
+for part in "$some/2" "$more/2" "$all_homes/2" $(for n in $views; do [ "$n" = 2 ] || echo "$some/$n"; done); do
   file=$(fileOf "${part%/*}" "${part#*/}")
   if [ -s "$file" ]; then set -- "$@" "$file"; fi
+done
+captures=
+for name in redkitchen diningroom livingroom_rendered; do
+  file=$results/completion-$name.jsonl
+  if [ -s "$file" ]; then captures="$captures $file"; fi
 done
 {
   printf 'Mean +- standard deviation over scenes (sh examples/lab/study.sh).\n\n'
   "$lab" tables "$@" --csv "$results/completion.csv" --reliability "$results/reliability.csv"
+  printf '\nReal captures, judged by their other frames.\n\n'
+  # shellcheck disable=SC2086  # one word each
+  for file in $captures; do
+    "$lab" tables "$file" --scores mean_psnr mean_ssim mean_flip near_precision near_recall near_f1 blocked right open ece
+  done
 } >"$folder/completion.md"
 mv "$folder/completion.md" "$results/completion.md"
 
@@ -84,7 +109,7 @@ two(kind) = of(kind, "completed") && column("views") == 2 ? column("probability"
 plot x with lines lc "gray" dt 2 title "calibrated", "reliability.csv" using (two("rooms")):"share" with linespoints lw 1.5 pt 7 ps .5 lc 5 title "rooms", \
   "" using (two("homes")):"share" with linespoints lw 1.5 pt 7 ps .5 lc 3 title "homes"
 PLOT
-gnuplot <<'PLOT'
+[ -z "$taus" ] || gnuplot <<'PLOT'
 set terminal svg size 1350,400 font "sans,13" background "white"
 set output "../tau.svg"
 set datafile separator ","; set datafile columnheaders
