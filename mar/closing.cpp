@@ -12,8 +12,8 @@
 namespace vdbc {
 namespace {
 
-constexpr int kClosedLevel = 1;      // tokens are nodes of 2^3 voxels
-constexpr size_t kLargestHole = 12;  // tokens: half a square metre
+constexpr int kClosedLevel = 1;       // tokens are nodes of 2^3 voxels
+constexpr size_t kLargestHole = 100;  // tokens: four square metres
 
 using Traits = boost::adjacency_list_traits<boost::vecS, boost::vecS, boost::directedS>;
 using Edge = Traits::edge_descriptor;

@@ -12,7 +12,7 @@
 namespace vdbc {
 
 struct CompleteSettings {
-  float tau = .5f;         // a token is kept if its occupancy probability exceeds this
+  float tau = .45f;        // a token is kept if its occupancy probability exceeds this
   float coarse_tau = .1f;  // the coarse stage's gate: high recall
   /// Dropped tokens above this probability are taken back where they close a small hole (a minimum
   /// cut between what was seen empty and the border of the volume); 1: none.

@@ -348,16 +348,16 @@ TEST(ClosingTokens, OnlyUnobservedTokensOfTheVolumeCanClose) {
 }
 
 TEST(ClosingTokens, ALargeHoleStaysOpen) {
-  // A box of walls without one of them: 4 x 3 tokens close it, 4 x 4 are too many.
-  for (int height : {3, 4}) {
+  // A box of walls without one of them: 10 x 10 tokens close it, 10 x 11 are too many.
+  for (int height : {10, 11}) {
     SeenSpace nodes;
-    nodes.level = 1, nodes.box = CoordBBox(Coord(0), Coord(9));
+    nodes.level = 1, nodes.box = CoordBBox(Coord(0), Coord(15));
     std::vector<Coord> walls;
     Place dropped;
-    for (const Coord& c : nodesOf(CoordBBox(Coord(1), Coord(6, 6, 2 + height)))) {
+    for (const Coord& c : nodesOf(CoordBBox(Coord(1), Coord(6, 12, 2 + height)))) {
       const bool inside =
-          c.x() > 1 && c.x() < 6 && c.y() > 1 && c.y() < 6 && c.z() > 1 && c.z() < 2 + height;
-      const bool missing = c.x() == 6 && c.y() > 1 && c.y() < 6 && c.z() > 1 && c.z() < 2 + height;
+          c.x() > 1 && c.x() < 6 && c.y() > 1 && c.y() < 12 && c.z() > 1 && c.z() < 2 + height;
+      const bool missing = c.x() == 6 && c.y() > 1 && c.y() < 12 && c.z() > 1 && c.z() < 2 + height;
       if (missing)
         dropped.ijk.push_back(c), dropped.probability.push_back(.4f);
       else if (inside)
@@ -367,7 +367,7 @@ TEST(ClosingTokens, ALargeHoleStaysOpen) {
     }
     dropped.bfs_level.assign(dropped.ijk.size(), 1);
     dropped.generated.assign(dropped.ijk.size(), 1);
-    EXPECT_EQ(closingTokens(nodes, walls, dropped, .1f).size(), height == 3 ? 12u : 0u);
+    EXPECT_EQ(closingTokens(nodes, walls, dropped, .1f).size(), height == 10 ? 100u : 0u);
   }
 }
 
