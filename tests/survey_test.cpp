@@ -29,7 +29,8 @@ Made completed(const Eigen::Vector3d& shift, const std::string& stem) {
   std::vector<View> views = simpleRoomViews(2, 96, 72, 7);
   for (View& v : views) v.camera.world_from_camera.pretranslate(shift);
   Progress silent;
-  const SceneSettings settings;
+  SceneSettings settings;
+  settings.completion.tau = .5f;  // no token's probability is within rounding of it
   writePlace(completeScene(views, encoder, completer, settings, silent), views, encoder, settings,
              stem, silent);
   return {readSceneVdb(stem + ".vdb"), readPointsVdb(stem + ".points.vdb")};
