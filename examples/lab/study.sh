@@ -87,8 +87,8 @@ set multiplot layout 2,3 margins .05,.98,.08,.88 spacing .06,.15
 set grid
 set linetype 5 lc rgb "#d62728"
 methods = "observed pixel-aligned nearest box completed oracle-occupancy"
-scores = "psnr ssim flip f1 leak"
-titles = "'PSNR [dB]' 'SSIM' 'FLIP (low is good)' 'Strict F1 of unseen nodes' 'Leak (low is good)'"
+scores = "mean_psnr mean_flip near_f1 f1 leak"
+titles = "'PSNR over mean colour [dB]' 'FLIP (low is good)' 'Near F1 of unseen voxels' 'Strict F1 of unseen nodes' 'Leak (low is good)'"
 set xlabel "views in"
 set offsets .5, .5, 0, 0
 unset key
