@@ -30,7 +30,7 @@ constexpr float kPlaneSigma = .9f;        // of a disc that continues a plane, v
 constexpr float kPlaneThickness = .003f;  // metres
 constexpr float kBehind = .03f;  // metres; what continues a plane lies behind what was seen of it
 
-constexpr int kSideDirections = 4;  // to both sides each, in which a Gaussian is looked at
+constexpr int kSideDirections = 8;  // to both sides each, in which a Gaussian is looked at
 constexpr float kInner = 1.3f, kOuter = 3.3f;  // sigmas; beyond nothing is drawn
 constexpr int kMostCuts = 14, kMostPushes = 2;
 constexpr float kCut = .85f;             // what a cut leaves of a Gaussian's width
