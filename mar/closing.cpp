@@ -12,7 +12,6 @@
 namespace vdbc {
 namespace {
 
-constexpr int kClosedLevel = 1;       // tokens are nodes of 2^3 voxels
 constexpr size_t kLargestHole = 100;  // tokens: four square metres
 
 using Traits = boost::adjacency_list_traits<boost::vecS, boost::vecS, boost::directedS>;
@@ -121,9 +120,8 @@ class StandingRoom {
       lenses_.push_back(place.frame.toIndex(camera.world_from_camera.translation()));
   }
   bool holds(const Coord& node) const {
-    const double side = 1 << kClosedLevel;
-    const Eigen::Vector3d middle =
-        (Eigen::Vector3d(node.x(), node.y(), node.z()).array() + .5) * side;
+    const Coord first = firstVoxel(node, 1);  // of 2^3
+    const Eigen::Vector3d middle(first.x() + 1, first.y() + 1, first.z() + 1);
     return std::any_of(lenses_.begin(), lenses_.end(), [&](const Eigen::Vector3d& lens) {
       return (middle - lens).norm() <= radius_;
     });

@@ -188,8 +188,7 @@ TEST(Evaluate, ReliabilityCountsGeneratedNodes) {
   all.level = 1, all.box = CoordBBox(Coord(0), Coord(9));
   for (int x : {0, 1, 4}) all.filled.setValueOn(Coord(x, 0, 0));
   for (int x : {2, 3, 5}) all.empty.setValueOn(Coord(x, 0, 0));  // nobody saw the last one
-  Reliability r{};
-  for (const Outcome& o : outcomesOf(place, all)) vdbc::add(o, &r);
+  const Reliability r = reliabilityOf(outcomesOf(place, all));
   const std::array<int, 10> counts = {1, 0, 2, 0, 0, 0, 0, 1, 0, 1},
                             hits = {0, 0, 1, 0, 0, 0, 0, 0, 0, 1};
   for (size_t i = 0; i < r.size(); ++i) {

@@ -78,9 +78,13 @@ EvaluationScene folderScene(const std::string& folder, int views, std::vector<in
   return s;
 }
 
+}  // namespace
+
 Eigen::Vector3d centreOf(const Coord& node) {
   return {2. * node.x() + 1, 2. * node.y() + 1, 2. * node.z() + 1};
 }
+
+namespace {
 
 // An opaque-looking Gaussian for a node of level 1.
 void addNode(const VoxelFrame& frame, const Coord& node, const Eigen::Vector3f& srgb,
@@ -383,10 +387,14 @@ int64_t outsideCount(const EvaluationScene& scene, const VoxelFrame& frame,
   });
 }
 
-void add(const Outcome& outcome, Reliability* bins) {
-  const double p = outcome.probability;
-  ReliabilityBin& bin = (*bins)[std::min(bins->size() - 1, size_t(p * double(bins->size())))];
-  ++bin.count, bin.sum_probability += p, bin.hits += outcome.occupied;
+Reliability reliabilityOf(const std::vector<Outcome>& outcomes) {
+  Reliability bins;
+  for (const Outcome& o : outcomes) {
+    const double p = o.probability;
+    ReliabilityBin& bin = bins[std::min(bins.size() - 1, size_t(p * double(bins.size())))];
+    ++bin.count, bin.sum_probability += p, bin.hits += o.occupied;
+  }
+  return bins;
 }
 
 SeenSpace seenByAll(const EvaluationScene& scene, const VoxelFrame& frame,
@@ -586,15 +594,15 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
   add("completed", completed, completed_seconds);
   results.back().peak_rss_mb = completed_rss;
 
-  const std::vector<Outcome> outcomes = outcomesOf(place, poolSeen(truths.all, 1));
+  const SeenSpace all_nodes = poolSeen(truths.all, 1);
+  const std::vector<Outcome> outcomes = outcomesOf(place, all_nodes);
   if (!outcomes.empty()) {
-    results.back().reliability.emplace();
-    for (const Outcome& o : outcomes) vdbc::add(o, &*results.back().reliability);
+    results.back().reliability = reliabilityOf(outcomes);
     results.back().ece = calibrationError(*results.back().reliability);
   }
   start = std::chrono::steady_clock::now();
   const std::vector<Coord> occupied =
-      scene.truth ? surfaceNodes(*scene.truth, frame, 1) : filledNodes(poolSeen(truths.all, 1));
+      scene.truth ? surfaceNodes(*scene.truth, frame, 1) : filledNodes(all_nodes);
   const Place oracle = completer.completeAt(seen_place, occupied, s.completion, progress);
   add("oracle-occupancy", look(oracle), observed_seconds + secondsSince(start));
   start = std::chrono::steady_clock::now();

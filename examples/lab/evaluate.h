@@ -46,6 +46,9 @@ struct SetScores {
 };
 SetScores setScores(const std::set<Coord>& filled, const std::set<Coord>& truth);
 
+/// Of a node of level 1, voxels.
+Eigen::Vector3d centreOf(const Coord& node);
+
 /// How many of `filled`, nodes of level 1 of the frame's grid, lie outside the scene's room: they
 /// are not in `truth`, the nodes that its surfaces pass, and their centre is not over its floor and
 /// below its ceilings. What stands behind the shell, exactly; a false node in a cupboard is not
@@ -66,7 +69,7 @@ struct ReliabilityBin {
   double sum_probability = 0;
 };
 using Reliability = std::array<ReliabilityBin, 10>;
-void add(const Outcome& outcome, Reliability* bins);
+Reliability reliabilityOf(const std::vector<Outcome>& outcomes);
 /// Expected calibration error: mean over the nodes of |share of hits - mean probability| of their
 /// bin (Naeini et al. 2015). NaN without nodes.
 double calibrationError(const Reliability& reliability);

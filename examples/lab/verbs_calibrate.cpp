@@ -9,6 +9,7 @@
 #include "examples/lab/verbs_lab.h"
 #include "houdini_style_tools/options.h"
 #include "houdini_style_tools/report.h"
+#include "vdb/file_io.h"
 
 namespace vdbc {
 namespace {
@@ -19,8 +20,8 @@ struct CalibrateOptions {
 };
 
 // What became of every token that completing a scene asks about.
-std::vector<Outcome> outcomesOf(const EvaluationScene& scene, const Encoder& encoder,
-                                const Completer& completer, Progress& progress) {
+std::vector<Outcome> allOutcomes(const EvaluationScene& scene, const Encoder& encoder,
+                                 const Completer& completer, Progress& progress) {
   SceneSettings settings;
   settings.detail.seconds = 0;
   settings.completion.tau = 0, settings.completion.hole_tau = 1;  // all are kept
@@ -32,10 +33,9 @@ std::vector<Outcome> outcomesOf(const EvaluationScene& scene, const Encoder& enc
 
 // The expected calibration error of outcomes under a curve.
 double errorOf(const std::vector<Outcome>& outcomes, const Calibration& curve) {
-  Reliability bins{};
-  for (const Outcome& o : outcomes)
-    add({calibrated(curve, logit(o.probability)), o.occupied}, &bins);
-  return calibrationError(bins);
+  std::vector<Outcome> after = outcomes;
+  for (Outcome& o : after) o.probability = calibrated(curve, logit(o.probability));
+  return calibrationError(reliabilityOf(after));
 }
 
 // The weights with a curve, in half floats.
@@ -54,16 +54,19 @@ void cookCalibrate(const CalibrateOptions& o, const Run& run, Progress& progress
   const Encoder encoder(weights + "/encoder.safetensors");
   const TensorFile file = readTensors(from);
   // What is fitted is what the rounded network says without a curve.
-  writeCalibrated(file, Completer(from).config(), {}, o.output);
-  const Completer completer(o.output);
+  const TemporaryFile rounded("calibrate", o.output);
+  writeCalibrated(file, Completer(from).config(), {}, rounded.path());
+  const Completer completer(rounded.path());
   // Of even and odd scenes: each half is judged by the curve of the other.
   std::array<std::vector<Outcome>, 2> halves;
   for (int views : o.views) {
     const SceneList scenes = sceneList(o.scenes, views, {}, run.seed);
+    if (scenes.count < 2)
+      throw UsageError(joinText("--scenes: ", o.scenes, ": expected at least two scenes"));
     for (int64_t i = 0; i < scenes.count; ++i) {
       const EvaluationScene scene = scenes.scene(i);
       const std::vector<Outcome> more =
-          naming(scene.name, [&] { return outcomesOf(scene, encoder, completer, progress); });
+          naming(scene.name, [&] { return allOutcomes(scene, encoder, completer, progress); });
       halves[size_t(i % 2)].insert(halves[size_t(i % 2)].end(), more.begin(), more.end());
     }
   }

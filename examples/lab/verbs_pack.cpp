@@ -8,6 +8,7 @@
 #include <optional>
 
 #include "examples/lab/condition_views.h"
+#include "examples/lab/evaluate.h"
 #include "examples/lab/packed_room.h"
 #include "examples/lab/scenes.h"
 #include "examples/lab/verbs_lab.h"
@@ -53,8 +54,7 @@ std::vector<SurfaceNode> surfacesOf(const Room& room, const VoxelFrame& frame) {
   const CoordBBox box = nodesIn(frame.bounds, 1);
   for (const Coord& node : surfaceNodes(solidMesh(room.surface), frame, 1)) {
     if (!box.isInside(node)) continue;
-    const Eigen::Vector3d centre(2 * node.x() + 1, 2 * node.y() + 1, 2 * node.z() + 1);
-    const Eigen::Vector3f p = frame.toWorld(centre).cast<float>();
+    const Eigen::Vector3f p = frame.toWorld(centreOf(node)).cast<float>();
     surfaces.push_back({node, isWithin(room, room.world_from_room.inverse() * p)});
   }
   return surfaces;
