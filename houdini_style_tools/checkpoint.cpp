@@ -71,8 +71,8 @@ void readCheckpoint(const std::string& path, const std::string& identity, Place*
           growth.dump(), ")");
   place.growth.clear();
   place.detail = start->detail, place.cameras = start->cameras;  // not of the file
+  settings->first_level = next_level, settings->begun_with = start->size();
   *start = std::move(place);
-  settings->first_level = next_level, settings->resumed = true;
 }
 
 }  // namespace vdbc

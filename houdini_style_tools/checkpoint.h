@@ -15,7 +15,7 @@ std::string completionIdentity(const Completer& completer, const Place& start,
 void writeCheckpoint(const Place& so_far, int32_t next_level, const std::string& identity,
                      const std::string& path);
 
-/// The place so far instead of `start`; sets `settings->first_level` and `resumed`. Throws Error
+/// The place so far instead of `start`; sets `settings->first_level` and `begun_with`. Throws Error
 /// unless the file is there and of this identity and encoder.
 void readCheckpoint(const std::string& path, const std::string& identity, Place* start,
                     CompleteSettings* settings);

@@ -51,14 +51,11 @@ Place Completer::complete(const Place& start, const CompleteSettings& s, Progres
   Place dropped;
   Growth g = beginGrowth(net, start, s, &dropped);
   GrowthScene scene = growthScene(start, net.config);
-  openGate(net, s.coarse_tau, &scene, progress);
-  std::vector<Coord> open;
-  for (size_t i = 0; i < scene.gate.size(); ++i)
-    if (scene.gate.values()[i] > s.coarse_tau) open.push_back(scene.gate.tokens()[i]);
-  std::sort(open.begin(), open.end());
+  const std::vector<Coord> open = openGate(net, s.coarse_tau, &scene, progress);
   growLevels(
       net, scene, unobservedChildren(open, scene.tokens.nodes), s,
       [&](float probability) { return probability > s.tau; }, progress, listener, &g, &dropped);
+  thinSurfaces(&g, &dropped);
   if (s.hole_tau < s.tau) closeHoles(net, scene.tokens.nodes, dropped, s.hole_tau, &g);
   if (s.refine_observed) refineObserved(net, scene, s, &g);
   progress.end();

@@ -33,13 +33,14 @@ struct CompleteSettings {
   std::shared_ptr<const TokenMask> region;
   /// Growth levels below it are taken as done.
   int32_t first_level = 1;
-  /// `start` is a LevelListener's: generated tokens that do not exceed tau were dropped.
-  bool resumed = false;
+  /// Of a `start` that is a LevelListener's: how many rows that completion began with; what comes
+  /// after them and does not exceed tau was dropped. -1: it is none.
+  int64_t begun_with = -1;
 };
 
-/// Called after each growth level with all tokens so far (dropped ones too, if holes are to be
-/// closed) and the level that comes next. Completing those tokens from that level on, `resumed`,
-/// gives, bit by bit, what the uninterrupted run gives.
+/// Called after each growth level with all tokens so far, dropped ones too, and the level that
+/// comes next. Completing those tokens from that level on, with `begun_with`, gives, bit by bit,
+/// what the uninterrupted run gives.
 using LevelListener = std::function<void(const Place& so_far, int32_t next_level)>;
 
 /// Trained networks, loaded once. Const calls may run at the same time from several threads.
@@ -55,7 +56,8 @@ class Completer {
   /// The scenes it was trained on, as the file says (`rooms:SEED-SEED`).
   std::string trainedOn() const;
 
-  /// `start` plus generated tokens: coarse gate, then growth level by level. `start` has observed
+  /// `start` plus generated tokens: coarse gate, then growth level by level, then surfaces are
+  /// thinned to one token and small holes closed. `start` has observed
   /// tokens first; generated ones after them stay as they are and are not visited again. Its rows
   /// come first, bit-identical unless refine_observed; generated latents are rounded to half
   /// precision, so that files hold them exactly. Tokens that are F or E in `start.seen` are never

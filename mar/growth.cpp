@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <random>
 
+#include "mar/thinning.h"
+
 namespace vdbc {
 namespace {
 
@@ -83,22 +85,25 @@ Growth beginGrowth(CompleterNet& net, const Place& start, const CompleteSettings
   require(seeds > 0, "Completer: the place is empty (expected observed tokens)");
   require(std::is_sorted(start.generated.begin(), start.generated.end()),
           "Completer: the place: expected observed tokens before generated ones");
-  const auto stays = [&](size_t i) {
-    return !s.resumed || !start.generated[i] || start.probability[i] > s.tau;
-  };
+  const int64_t given = s.begun_with < 0 ? start.size() : s.begun_with;
+  require(given >= seeds && given <= start.size(), "Completer: the place: expected ", given,
+          " rows that the completion began with, found ", start.size());
+  const auto stays = [&](size_t i) { return int64_t(i) < given || start.probability[i] > s.tau; };
   *dropped = keepRows(start, [&](size_t i) { return !stays(i); });
-  Growth g{keepRows(start, stays), {}, {start.ijk.begin(), start.ijk.begin() + seeds}};
+  Growth g{keepRows(start, stays), {}, {start.ijk.begin(), start.ijk.begin() + seeds}, given};
   g.z = net.standardise(latentsOf(g.place));
   return g;
 }
 
 GrowthScene growthScene(const Place& start, const CompleterConfig& config) {
-  return {sceneTokens(poolSeen(*start.seen, 1), poolSeen(*start.seen, 2)),
-          Windows(start.frame, config),
-          {}};
+  SceneTokens tokens = sceneTokens(poolSeen(*start.seen, 1), poolSeen(*start.seen, 2));
+  CoordBBox content;
+  for (const Coord& c : tokens.coarse_filled) content.expand(voxelsIn(c, kTokenLevels - 1));
+  return {std::move(tokens), Windows(start.frame, content, config), {}};
 }
 
-void openGate(CompleterNet& net, float coarse_tau, GrowthScene* scene, Progress& progress) {
+std::vector<Coord> openGate(CompleterNet& net, float coarse_tau, GrowthScene* scene,
+                            Progress& progress) {
   constexpr int kCoarse = kTokenLevels - 1;
   struct Part {
     SceneTokens tokens;
@@ -118,11 +123,22 @@ void openGate(CompleterNet& net, float coarse_tau, GrowthScene* scene, Progress&
     parts.push_back(std::move(part));
   }
 
-  std::vector<Coord> open = scene->tokens.coarse_filled;
-  for (const Coord& c : open) scene->gate.set(c, 1);
-  while (!open.empty() && !pending.empty()) {
-    const TokenMask beside = maskFromCoords(neighbourRing(open));
-    open.clear();
+  // The open nodes, all of them, and those whose neighbours are still to be looked at.
+  TokenMask open, beside;  // `beside`: neighbours of open nodes
+  std::vector<Coord> found = scene->tokens.coarse_filled;
+  for (const Coord& c : found) scene->gate.set(c, 1), open.setValueOn(c);
+  const auto openNode = [&](const Coord& c) {
+    const float* p = scene->gate.find(c);
+    if (!p || !(*p > coarse_tau) || open.isValueOn(c)) return;
+    open.setValueOn(c), found.push_back(c);
+  };
+  while (!found.empty()) {
+    // What was asked with another node's chunk opens when growth gets to it.
+    while (!found.empty()) {
+      const std::vector<Coord> ring = neighbourRing(found);
+      found.clear();
+      for (const Coord& c : ring) beside.setValueOn(c), openNode(c);
+    }
     const auto reached =
         std::stable_partition(pending.begin(), pending.end(), [&](const Chunk& chunk) {
           const openvdb::tree::ValueAccessor<const TokenMask> is_beside(beside);
@@ -141,10 +157,14 @@ void openGate(CompleterNet& net, float coarse_tau, GrowthScene* scene, Progress&
     });
     for (size_t i = 0; i < chunks.size(); ++i)
       for (size_t k = 0; k < chunks[i].tokens.size(); ++k) {
-        scene->gate.set(chunks[i].tokens[k], probability[i][k]);
-        if (probability[i][k] > coarse_tau) open.push_back(chunks[i].tokens[k]);
+        const Coord& c = chunks[i].tokens[k];
+        scene->gate.set(c, probability[i][k]);
+        if (beside.isValueOn(c)) openNode(c);
       }
   }
+  std::vector<Coord> nodes = activeCoords(open);
+  std::sort(nodes.begin(), nodes.end());
+  return nodes;
 }
 
 void growLevels(CompleterNet& net, const GrowthScene& scene, const std::vector<Coord>& candidates,
@@ -177,14 +197,24 @@ void growLevels(CompleterNet& net, const GrowthScene& scene, const std::vector<C
     appendRows(dropped, keepRows(asked, [&](size_t i) { return !kept(i); }));
     g->append(keepRows(asked, kept), net);
     if (!listener) continue;
-    if (s.hole_tau < s.tau) {  // closing holes asks for what was dropped
-      Growth all = *g;
-      all.append(*dropped, net);
-      listener(all.place, level + 1);
-    } else {
-      listener(g->place, level + 1);
-    }
+    Place all = g->place;
+    appendRows(&all, *dropped);
+    listener(all, level + 1);
   }
+}
+
+void thinSurfaces(Growth* g, Place* dropped) {
+  const auto given = size_t(g->given);
+  Place asked = keepRows(g->place, [&](size_t i) { return i >= given; });
+  appendRows(&asked, *dropped);
+  const std::vector<uint8_t> thick = thickTokens(asked);
+  const auto stays = [&](size_t i) { return i < given || !thick[i - given]; };
+  std::vector<int64_t> rows;
+  for (size_t i = 0; i < g->place.ijk.size(); ++i)
+    if (stays(i)) rows.push_back(int64_t(i));
+  appendRows(dropped, keepRows(g->place, [&](size_t i) { return !stays(i); }));
+  g->place = selectRows(g->place, rows);
+  g->z = rowsOf(g->z, rows);
 }
 
 void refineObserved(CompleterNet& net, const GrowthScene& scene, const CompleteSettings& s,

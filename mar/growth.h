@@ -14,6 +14,7 @@ struct Growth {
   Place place;
   Tensor z;
   std::vector<Coord> observed;
+  int64_t given = 0;  // rows that growth began with
 
   int64_t seeds() const { return int64_t(observed.size()); }
   void append(const Place& more, CompleterNet& net);
@@ -34,8 +35,11 @@ struct GrowthScene {
 GrowthScene growthScene(const Place& start, const CompleterConfig& config);
 
 /// Asks the coarse stage wherever growth can get to: chunks of unknown nodes that touch what is
-/// filled, then those that touch what the stage keeps (its probability exceeds `coarse_tau`).
-void openGate(CompleterNet& net, float coarse_tau, GrowthScene* scene, Progress& progress);
+/// filled, then those that touch an open node. A node is open where it is filled, or where its
+/// probability exceeds `coarse_tau` and an open node touches it: nothing grows out of nothing.
+/// The open nodes, by x, then y, then z.
+std::vector<Coord> openGate(CompleterNet& net, float coarse_tau, GrowthScene* scene,
+                            Progress& progress);
 
 /// Visits candidates level by level; keeps those that `keep` accepts given their probability, the
 /// others are added to `dropped`. Levels are distances from what was observed, whatever of them is
@@ -43,6 +47,9 @@ void openGate(CompleterNet& net, float coarse_tau, GrowthScene* scene, Progress&
 void growLevels(CompleterNet& net, const GrowthScene& scene, const std::vector<Coord>& candidates,
                 const CompleteSettings& settings, const std::function<bool(float)>& keep,
                 Progress& progress, const LevelListener& listener, Growth* growth, Place* dropped);
+
+/// Moves to `dropped` what only thickens surfaces (mar/thinning.h); what was given stays.
+void thinSurfaces(Growth* growth, Place* dropped);
 
 /// Condition latents rewritten from everything that was decoded, chunk by chunk.
 void refineObserved(CompleterNet& net, const GrowthScene& scene, const CompleteSettings& settings,

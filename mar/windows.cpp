@@ -8,18 +8,22 @@
 
 namespace vdbc {
 
-Windows::Windows(const VoxelFrame& whole, const CompleterConfig& config) : whole_(whole) {
+Windows::Windows(const VoxelFrame& whole, const CoordBBox& content, const CompleterConfig& config)
+    : whole_(whole) {
   constexpr int kCoarse = 1 << (kTokenLevels - 1);  // voxels: no window cuts a coarse node
-  const double extent_m = double(config.positions.extent_m),
-               overlap_m = double(config.window_overlap_m);
-  overlap_ = int(std::lround(overlap_m / whole.voxel_m / kCoarse)) * kCoarse;
+  const double extent = double(config.positions.extent_m) / whole.voxel_m;  // voxels
+  overlap_ = int(std::lround(config.window_overlap_m / whole.voxel_m / kCoarse)) * kCoarse;
+  const int64_t pitch = int64_t((extent - 2 * overlap_) / kCoarse) * kCoarse;
   for (int axis = 0; axis < 3; ++axis) {
-    const int begin = whole.bounds.min()[axis], side = whole.bounds.dim()[axis];
-    const double side_m = side * double(whole.voxel_m);
-    const int parts = side_m <= extent_m ? 1 : int(std::ceil(side_m / (extent_m - 2 * overlap_m)));
-    for (int part = 0; part < parts; ++part)
-      begin_[size_t(axis)].push_back(
-          part ? (begin + int(int64_t(side) * part / parts)) & ~(kCoarse - 1) : begin);
+    const int64_t begin = whole.bounds.min()[axis], end = int64_t(whole.bounds.max()[axis]) + 1,
+                  low = content.min()[axis], high = int64_t(content.max()[axis]) + 1;
+    begin_[size_t(axis)] = {int(begin)};
+    if (double(end - begin) <= extent) continue;
+    // As few windows as can hold the content, and it in their middle.
+    const int64_t parts = std::max<int64_t>(1, (high - low + pitch - 1) / pitch),
+                  first = ((low + high - parts * pitch) / 2) & ~(kCoarse - 1);
+    for (int64_t cut = first + (begin - first) / pitch * pitch; cut < end; cut += pitch)
+      if (cut > begin) begin_[size_t(axis)].push_back(int(cut));
   }
 }
 

@@ -14,11 +14,13 @@ struct Window {
   VoxelFrame frame;  // its bounds are the core grown by the overlap
 };
 
-/// Cuts a volume into windows no wider than the position code was made for. Windows are numbered,
-/// z fastest, and made when asked for: a wide volume has many, of which few hold anything.
+/// Cuts a volume into windows no wider than the position code was made for, around its content: a
+/// room that fits into one window is not cut, however wide the volume. Windows are numbered, z
+/// fastest, and made when asked for: a wide volume has many, of which few hold anything.
 class Windows {
  public:
-  Windows(const VoxelFrame& whole, const CompleterConfig& config);
+  /// `content` [voxels]: the coarse nodes where something was observed.
+  Windows(const VoxelFrame& whole, const CoordBBox& content, const CompleterConfig& config);
 
   Window window(size_t number) const;
   /// The window whose core holds the first voxel of a node of `level`.

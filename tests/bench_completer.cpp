@@ -69,11 +69,7 @@ const Candidates& bundledCandidates() {
         encodeScene(readViews(VDBC_SOURCE_DIR "/examples/two_views"), encoder, {}, silent);
     const float coarse_tau = CompleteSettings().coarse_tau;
     GrowthScene scene = growthScene(place, network().config);
-    openGate(network(), coarse_tau, &scene, silent);
-    std::vector<Coord> open;
-    for (size_t i = 0; i < scene.gate.size(); ++i)
-      if (scene.gate.values()[i] > coarse_tau) open.push_back(scene.gate.tokens()[i]);
-    std::sort(open.begin(), open.end());
+    const std::vector<Coord> open = openGate(network(), coarse_tau, &scene, silent);
     Candidates c;
     c.candidates = unobservedChildren(open, scene.tokens.nodes);
     c.levels = breadthFirstLevels(c.candidates, place.ijk);

@@ -38,7 +38,7 @@ std::vector<Window> allOf(const Windows& windows, const VoxelFrame& frame) {
 TEST(Windows, CoresPartTheVolumeAndCutNoCoarseNode) {
   size_t most = 0;
   for (const VoxelFrame& frame : volumes()) {
-    const Windows windows(frame, CompleterConfig());
+    const Windows windows(frame, frame.bounds, CompleterConfig());
     const std::vector<Window> all = allOf(windows, frame);
     most = std::max(most, all.size());
     uint64_t volume = 0;
@@ -63,7 +63,7 @@ TEST(Windows, FramesAreCoresWithTheirSurroundingsInThePositionCodesExtent) {
   narrow.positions.extent_m = 6, narrow.window_overlap_m = .8f;
   for (const CompleterConfig& config : {CompleterConfig(), narrow})
     for (const VoxelFrame& frame : volumes()) {
-      const Windows windows(frame, config);
+      const Windows windows(frame, frame.bounds, config);
       const int overlap =
           int(std::lround(config.window_overlap_m / frame.voxel_m / 4)) * 4;  // whole coarse nodes
       for (const Window& w : allOf(windows, frame)) {
@@ -88,7 +88,7 @@ TEST(Windows, FramesAreCoresWithTheirSurroundingsInThePositionCodesExtent) {
 TEST(Windows, AroundAreThoseWhoseFramesHoldANode) {
   std::mt19937 random(1);
   for (const VoxelFrame& frame : volumes()) {
-    const Windows windows(frame, CompleterConfig());
+    const Windows windows(frame, frame.bounds, CompleterConfig());
     const std::vector<Window> all = allOf(windows, frame);
     for (int level : {1, 2})
       for (int trial = 0; trial < 60; ++trial) {
@@ -114,7 +114,7 @@ TEST(Windows, AroundAreThoseWhoseFramesHoldANode) {
 TEST(Windows, SplitKeepsTokensAndTheirOrder) {
   std::mt19937 random(2);
   const VoxelFrame frame = volumes()[3];
-  const Windows windows(frame, CompleterConfig());
+  const Windows windows(frame, frame.bounds, CompleterConfig());
   std::vector<Coord> tokens;
   for (auto node = nodesIn(frame.bounds, 1).begin(); node; ++node)
     if (random() % 20 == 0) tokens.push_back(*node);
@@ -125,10 +125,22 @@ TEST(Windows, SplitKeepsTokensAndTheirOrder) {
   EXPECT_EQ(windows.split(tokens), truth);
 }
 
+TEST(Windows, ContentThatFitsIntoOneIsNotCut) {
+  std::mt19937 random(3);
+  const VoxelFrame frame = frameOf(CoordBBox(Coord(-501, -333, -20), Coord(499, 707, 31)), .1f);
+  for (int trial = 0; trial < 100; ++trial) {
+    const Coord low(int(random() % 224) - 125, int(random() % 224) - 83, -5);
+    const Coord side(int(random() % 24), int(random() % 24), 9);  // coarse nodes, less one
+    const CoordBBox content(firstVoxel(low, 2), voxelsIn(low + side, 2).max());
+    const Windows windows(frame, content, CompleterConfig());
+    ASSERT_EQ(windows.of(content.min(), 0), windows.of(content.max(), 0)) << content;
+  }
+}
+
 TEST(Windows, AVolumeOfAnySizeCostsNothing) {
   // 10^5 windows a side.
   const VoxelFrame frame = frameOf(CoordBBox(Coord(-4800000), Coord(4799999)), .1f);
-  const Windows windows(frame, CompleterConfig());
+  const Windows windows(frame, frame.bounds, CompleterConfig());
   const size_t middle = windows.of(Coord(0), 1);
   EXPECT_TRUE(windows.window(middle).core.isInside(Coord(0)));
   const std::vector<size_t> around = windows.around({Coord(0)}, 1);
