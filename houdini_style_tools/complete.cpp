@@ -26,8 +26,9 @@ namespace {
 
 std::shared_ptr<const Detail> detailOf(const std::vector<View>& views, const Place& place,
                                        const SceneSettings& settings, Progress& progress) {
-  const auto detail = std::make_shared<Detail>(
-      seenDetail(views, settings.detail, place.frame.world_from_grid.translation(), progress));
+  const auto detail =
+      std::make_shared<Detail>(seenDetail(views, settings.detail, settings.observing.carving,
+                                          place.frame.world_from_grid.translation(), progress));
   std::vector<DepthView> depths;
   for (const View& view : views) depths.push_back(view.depthView());
   FuseSettings fusing;

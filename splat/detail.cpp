@@ -59,7 +59,7 @@ double fitSeconds(int64_t splats, int64_t pixels) {
 }
 
 Detail seenDetail(const std::vector<View>& views, const DetailSettings& settings,
-                  const Eigen::Vector3d& origin, Progress& progress) {
+                  const CarveSettings& carving, const Eigen::Vector3d& origin, Progress& progress) {
   require(settings.seconds >= 0 && settings.splats >= 0,
           "seenDetail: expected seconds and a budget that are not negative, found ",
           settings.seconds, ", ", settings.splats);
@@ -68,7 +68,7 @@ Detail seenDetail(const std::vector<View>& views, const DetailSettings& settings
   detail.discs.antialias = true;
   if (views.empty() || settings.seconds == 0) return detail;
   const auto start = std::chrono::steady_clock::now();
-  std::vector<SeenImage> images = seenImages(views, settings.carving);
+  std::vector<SeenImage> images = seenImages(views, carving);
   for (SeenImage& image : images) image.view.camera = cameraFrom(origin, image.view.camera);
   detail.discs = discsWithin(images, settings.splats);
   const double step = meanStepSeconds(images, detail.discs.size());

@@ -17,8 +17,7 @@ struct DetailSettings {
   double seconds = 2;
   /// Of discs, at most; 0: as many as what was seen asks for. Plain walls ask for few.
   int64_t splats = 0;
-  float voxel_m = 0;      // of the level set (FuseSettings)
-  CarveSettings carving;  // which pixels have a depth
+  float voxel_m = 0;  // of the level set (FuseSettings)
   uint64_t seed = 1;
 };
 
@@ -34,10 +33,11 @@ struct Detail {
   double seconds = 0;            // that making the discs took
 };
 
-/// Discs of everything that the views saw; means are from `origin`. Views of more than a million
+/// Discs of everything that the views saw; `carving` says which pixels have a depth, means are from
+/// `origin`. Views of more than a million
 /// pixels are looked at reduced. Parallel; the same bytes for any number of threads. Throws Error
 /// for views without colour or depth, and Cancelled.
 Detail seenDetail(const std::vector<View>& views, const DetailSettings& settings,
-                  const Eigen::Vector3d& origin, Progress& progress);
+                  const CarveSettings& carving, const Eigen::Vector3d& origin, Progress& progress);
 
 }  // namespace vdbc

@@ -36,15 +36,15 @@ float ownWeight(const std::vector<SeenImage>& images, size_t i, int x, int y,
   int supported = 0, seen_through = 0;
   for (size_t j : neighbours) {
     const SeenImage& other = images[j];
-    const auto at = other.pixelOf(point);
-    if (!at) continue;
-    const Verdict verdict = verdictOf(other, at->x, at->y, 1 / at->z);
+    const Vector3d uvz = other.view.camera.project(point);
+    const int64_t o = other.view.camera.pixelAt(uvz);
+    if (o < 0) continue;
+    const Verdict verdict = verdictOf(other, int(uvz.x()), int(uvz.y()), 1 / uvz.z());
     seen_through += verdict == Verdict::kThrough;
     if (verdict != Verdict::kSame) continue;
     ++supported;
-    const size_t o = other.pixel(at->x, at->y);
     const float mine = image.footprint[p] / image.weight[p],
-                theirs = other.footprint[o] / other.weight[o];
+                theirs = other.footprint[size_t(o)] / other.weight[size_t(o)];
     if (theirs < mine * .999f || (theirs <= mine * 1.001f && j < i)) return 0;
   }
   if (seen_through > supported || (seen_through && image.weight[p] < 1)) return kThrough;

@@ -158,11 +158,8 @@ class Bounds {
     return cameras_[view].project(p.cast<double>());
   }
   float depthAt(size_t view, const Vector3d& uvz) const {
-    const Camera& c = cameras_[view];
-    if (!(uvz.z() > 0) || !(uvz.x() >= 0) || !(uvz.y() >= 0) || !(uvz.x() < c.width) ||
-        !(uvz.y() < c.height))
-      return 0;
-    return depths_[view][size_t(uvz.y()) * size_t(c.width) + size_t(uvz.x())];
+    const int64_t pixel = cameras_[view].pixelAt(uvz);
+    return pixel < 0 ? 0 : depths_[view][size_t(pixel)];
   }
 
   const std::vector<Camera>& cameras_;

@@ -262,14 +262,6 @@ SeenImage seenImage(const View& given, const CarveSettings& carving) {
 
 }  // namespace
 
-std::optional<SeenImage::Projected> SeenImage::pixelOf(const Eigen::Vector3d& point) const {
-  const Eigen::Vector3d uvz = view.camera.project(point);
-  const bool inside =
-      uvz.z() > 0 && uvz.x() >= 0 && uvz.y() >= 0 && uvz.x() < width() && uvz.y() < height();
-  if (!inside) return std::nullopt;
-  return Projected{int(uvz.x()), int(uvz.y()), uvz.z()};
-}
-
 Verdict verdictOf(const SeenImage& other, int x, int y, double q) {
   const double there = double(other.q[other.pixel(x, y)]);
   if (there > 0 && std::abs(there - q) <= std::max(3 * other.noise, .01 * q)) return Verdict::kSame;
@@ -295,7 +287,9 @@ std::vector<size_t> neighboursOf(const std::vector<SeenImage>& images, size_t i)
     for (int y = step / 2; y < image.height(); y += step)
       for (int x = step / 2; x < image.width(); x += step) {
         const float q = image.q[image.pixel(x, y)];
-        if (q > 0) count += images[j].pixelOf(image.point(x, y)).has_value();
+        if (q > 0)
+          count +=
+              images[j].view.camera.pixelAt(images[j].view.camera.project(image.point(x, y))) >= 0;
       }
     if (count > 0) shared.emplace_back(-count, j);
   }

@@ -2,7 +2,6 @@
 // Private: what a view saw, pixel by pixel, and sums over rectangles of it: planes are affine in
 // 1/z.
 #include <array>
-#include <optional>
 #include <vector>
 
 #include "splat/view.h"
@@ -60,12 +59,6 @@ struct SeenImage {
   Eigen::Vector3d point(int x, int y) const {
     return view.camera.unproject(x + .5, y + .5, 1 / double(q[pixel(x, y)]));
   }
-  struct Projected {
-    int x, y;
-    double z;  // metres
-  };
-  /// Of a world point in front of the camera that falls into the image.
-  std::optional<Projected> pixelOf(const Eigen::Vector3d& point) const;
 };
 
 /// What a view says of a point that lies 1/q deep at its pixel (x, y).

@@ -2,6 +2,8 @@
 
 #include <gtest/gtest.h>
 
+#include <cmath>
+
 namespace vdbc {
 namespace {
 
@@ -38,6 +40,19 @@ TEST(Camera, LooksAtItsTarget) {
   EXPECT_TRUE(seen.isApprox(Vector3d(320, 240, (target - eye).norm())));
   EXPECT_NEAR(above.x(), 320, 1e-9);
   EXPECT_LT(above.y(), 240);
+}
+
+TEST(Camera, FindsThePixelOfAPointOrNone) {
+  const Camera camera{4, 3, 2, 2, 2, 1.5, Eigen::Isometry3d::Identity()};
+  for (int i = 0; i < 12; ++i)
+    for (const double z : {.5, 20.})
+      EXPECT_EQ(camera.pixelAt(camera.project(camera.unproject(i % 4 + .3, i / 4 + .9, z))), i);
+  EXPECT_EQ(camera.pixelAt({0, 0, 1}), 0);
+  const double nan = std::nan("");
+  for (const Vector3d& none :
+       {Vector3d(4, 1, 1), Vector3d(1, 3, 1), Vector3d(-.1, 1, 1), Vector3d(1, -.1, 1),
+        Vector3d(1, 1, 0), Vector3d(1, 1, -1), Vector3d(nan, 1, 1), Vector3d(1, 1, nan)})
+    EXPECT_EQ(camera.pixelAt(none), -1) << none.transpose();
 }
 
 }  // namespace

@@ -73,7 +73,7 @@ DetailSettings seconds(double s) {
 
 Gaussians discsOf(const std::vector<View>& views, double s) {
   Progress silent;
-  return seenDetail(views, seconds(s), Vector3d::Zero(), silent).discs;
+  return seenDetail(views, seconds(s), {}, Vector3d::Zero(), silent).discs;
 }
 
 double psnrFrom(const Gaussians& g, const View& v) {
@@ -171,13 +171,14 @@ TEST(Detail, OneViewsExposureDoesNotSpoilTheOthers) {
 TEST(Detail, BudgetHolds) {
   Progress silent;
   DetailSettings settings = seconds(1e-9);
-  const int64_t all = seenDetail(boxViews(), settings, Vector3d::Zero(), silent).discs.size();
+  const int64_t all = seenDetail(boxViews(), settings, {}, Vector3d::Zero(), silent).discs.size();
   settings.splats = all / 2;
-  const int64_t half = seenDetail(boxViews(), settings, Vector3d::Zero(), silent).discs.size();
+  const int64_t half = seenDetail(boxViews(), settings, {}, Vector3d::Zero(), silent).discs.size();
   EXPECT_LE(half, all / 2);
   EXPECT_GT(half, all / 4);
   settings.splats = 3;
-  expectError([&] { seenDetail(boxViews(), settings, Vector3d::Zero(), silent); }, {"budget", "3"});
+  expectError([&] { seenDetail(boxViews(), settings, {}, Vector3d::Zero(), silent); },
+              {"budget", "3"});
 }
 
 TEST(Detail, TheSameBytesForAnyNumberOfThreadsAndFarFromTheWorldsOrigin) {
@@ -189,7 +190,7 @@ TEST(Detail, TheSameBytesForAnyNumberOfThreadsAndFarFromTheWorldsOrigin) {
   const Vector3d shift(500000, -200000, 100);
   for (View& v : far) v.camera.world_from_camera.pretranslate(shift);
   Progress silent;
-  const Gaussians there = seenDetail(far, seconds(1e-9), shift, silent).discs;
+  const Gaussians there = seenDetail(far, seconds(1e-9), {}, shift, silent).discs;
   const Gaussians here = discsOf(views, 1e-9);
   ASSERT_NEAR(double(there.size()), double(here.size()), 3);
   for (size_t i = 0; i < std::min(there.mean.size(), here.mean.size()); i += 50)
@@ -198,7 +199,7 @@ TEST(Detail, TheSameBytesForAnyNumberOfThreadsAndFarFromTheWorldsOrigin) {
 
 TEST(Detail, StrangeInputIsRefusedOrMakesNothing) {
   Progress silent;
-  EXPECT_EQ(seenDetail({}, seconds(1), Vector3d::Zero(), silent).discs.size(), 0);
+  EXPECT_EQ(seenDetail({}, seconds(1), {}, Vector3d::Zero(), silent).discs.size(), 0);
   EXPECT_EQ(discsOf(boxViews(), 0).size(), 0);
   View no_colour = boxViews()[0];
   no_colour.colour = {};

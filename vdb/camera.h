@@ -1,6 +1,7 @@
 #pragma once
 // Pinhole camera: OpenCV axes (x right, y down, z forward), camera-to-world, metres.
 #include <Eigen/Geometry>
+#include <cstdint>
 
 namespace vdbc {
 
@@ -17,6 +18,13 @@ struct Camera {
   Eigen::Vector3d project(const Eigen::Vector3d& p_world) const {
     const Eigen::Vector3d p = world_from_camera.inverse() * p_world;
     return {fx * p.x() / p.z() + cx, fy * p.y() / p.z() + cy, p.z()};
+  }
+  /// The pixel that shows a projected point (project()): y * width + x; -1 where none does.
+  int64_t pixelAt(const Eigen::Vector3d& uvz) const {
+    if (!(uvz.z() > 0) || !(uvz.x() >= 0) || !(uvz.y() >= 0) || !(uvz.x() < width) ||
+        !(uvz.y() < height))
+      return -1;
+    return int64_t(uvz.y()) * width + int64_t(uvz.x());
   }
   /// Pixel position and planar depth z (metres) -> world point.
   Eigen::Vector3d unproject(double u, double v, double z) const {

@@ -213,10 +213,9 @@ struct Evidence {
 
 // What a view says of a point in camera axes.
 void addDistance(const FuseView& v, const Vector3d& p, double band, Evidence* e) {
-  if (!(p.z() > 0)) return;
   const double u = v.camera.fx * p.x() / p.z() + v.camera.cx,
                w = v.camera.fy * p.y() / p.z() + v.camera.cy;
-  if (!(u >= 0) || !(w >= 0) || !(u < v.camera.width) || !(w < v.camera.height)) return;
+  if (v.camera.pixelAt({u, w, p.z()}) < 0) return;
   const float q = measuredAt(v, u, w);
   if (!(q > 0)) return;
   const double z = 1 / double(q);

@@ -52,11 +52,9 @@ JudgedViews measuredPart(const JudgedViews& all, const std::vector<View>& input)
           double(int(i) % w) + .5, double(int(i) / w) + .5, double(view.depth[i]));
       part.observed[v][i] = std::any_of(input.begin(), input.end(), [&](const View& other) {
         const Eigen::Vector3d uvz = other.camera.project(point);
-        if (!(uvz.z() > 0) || !(uvz.x() >= 0) || !(uvz.y() >= 0) ||
-            !(uvz.x() < other.camera.width) || !(uvz.y() < other.camera.height))
-          return false;
-        const float depth =
-            other.depth[size_t(uvz.y()) * size_t(other.camera.width) + size_t(uvz.x())];
+        const int64_t pixel = other.camera.pixelAt(uvz);
+        if (pixel < 0) return false;
+        const float depth = other.depth[size_t(pixel)];
         return depth > 0 && std::abs(double(depth) - uvz.z()) < kSeenWithin;
       });
     }
@@ -283,8 +281,8 @@ std::vector<ReconstructionResult> evaluateReconstruction(
   }
   if (s.detail.seconds > 0) {
     progress.start("detail");
-    const Detail detail =
-        seenDetail(scene.input, s.detail, o.frame.world_from_grid.translation(), progress);
+    const Detail detail = seenDetail(scene.input, s.detail, s.observing.carving,
+                                     o.frame.world_from_grid.translation(), progress);
     progress.end();
     measure("detail", detail.discs, secondsSince(start));
   }
