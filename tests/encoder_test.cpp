@@ -20,6 +20,7 @@
 #include "encoder/trainer.h"
 #include "encoder/weights.h"
 #include "splat/rasterize_torch.h"
+#include "tests/expect_error.h"
 #include "tests/simple_room.h"
 #include "vdb/fit_volume.h"
 #include "vdb/frontier.h"
@@ -1115,12 +1116,6 @@ TEST(EncoderTraining, PaperPresetRunsAStep) {  // sections 3.5 and 3.7: M = 216,
   EXPECT_TRUE(std::isfinite(after));
   EXPECT_NE(before, after);
 }
-
-/// Asks to stop when half of the work is done.
-class StopAtHalf : public Progress {
- public:
-  bool wasInterrupted(int percent = -1) override { return percent == 50; }
-};
 
 class EncoderResume : public InFolder {};
 

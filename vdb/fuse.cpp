@@ -9,6 +9,7 @@
 
 #include "vdb/continuation.h"
 #include "vdb/error.h"
+#include "vdb/median.h"
 #include "vdb/narrow_band.h"
 #include "vdb/vdb_file.h"
 
@@ -97,12 +98,6 @@ void findCosines(FuseView* v) {
       v->cosine[size_t(y) * size_t(v->cells_x) + size_t(x)] =
           float(std::clamp(q / length, kLeastCosine, 1.));
     }
-}
-
-double median(std::vector<double>* values) {
-  const auto middle = values->begin() + std::ptrdiff_t(values->size() / 2);
-  std::nth_element(values->begin(), middle, values->end());
-  return *middle;
 }
 
 // Second differences of 1/z vanish on planes: sigma from their median, along rows.

@@ -29,7 +29,6 @@ using Side = Home::Side;
 using Space = Home::Space;
 using Wall = Home::Wall;
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr char kExamples[] = "com/eteks/sweethome3d/io/resources/examples/";
 constexpr uint64_t kMostHomeBytes = 64 << 20;  // the largest example has 0.1 MB
 constexpr int kMostGroups = 16;                // of groups in groups

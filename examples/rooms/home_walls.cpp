@@ -16,8 +16,6 @@ using Item = Home::Item;
 using Wall = Home::Wall;
 using Baseboard = Home::Baseboard;
 
-constexpr double kPi = 3.14159265358979323846;
-
 /// Upper and lower edge of an SVG path with the commands M, v, h, a and z, which is all that the
 /// catalogues use, at `x`; the shapes have no overhangs.
 std::optional<std::pair<double, double>> shapeSpan(const std::string& path, double x) {
@@ -35,7 +33,7 @@ std::optional<std::pair<double, double>> shapeSpan(const std::string& path, doub
       const double side = (numbers[4] > 0) == (width > 0) ? -1 : 1;
       const Vector2d middle = at + Vector2d(width / 2, numbers[6] / 2);
       for (int i = 1; i <= 24; ++i) {
-        const double a = kPi * i / 24;
+        const double a = M_PI * i / 24;
         points.push_back(middle + Vector2d(-width / 2 * std::cos(a), side * height * std::sin(a)));
       }
       at += Vector2d(numbers[5], numbers[6]);
@@ -76,7 +74,7 @@ Hole holeOf(const Item& item, double level_elevation) {
   const int steps = is_round ? 24 : 1;
   for (int i = 0; i <= steps; ++i) {
     // Cosine spacing: fine where an arch is steep.
-    const double x = is_round ? .5 - .5 * std::cos(kPi * i / steps) : i;
+    const double x = is_round ? .5 - .5 * std::cos(M_PI * i / steps) : i;
     const auto span =
         is_round ? shapeSpan(item.cut_shape, std::clamp(x, 1e-7, 1 - 1e-7)) : std::nullopt;
     hole.cuts.push_back({(x - .5) * item.size.x(), bottom + height * (span ? 1 - span->second : 0),
@@ -101,7 +99,7 @@ WallLines unjoined(const Wall& wall) {
   }
   const Vector2d centre =
       (wall.start + wall.end) / 2 + leftOf(d) * (chord.norm() / 2 / std::tan(wall.arc / 2));
-  const int steps = std::clamp(int(std::ceil(std::abs(wall.arc) / (kPi / 48))), 2, 96);
+  const int steps = std::clamp(int(std::ceil(std::abs(wall.arc) / (M_PI / 48))), 2, 96);
   for (int i = 0; i <= steps; ++i) {
     const Vector2d from_centre =
         Eigen::Rotation2Dd(wall.arc * i / steps) * Vector2d(wall.start - centre);

@@ -22,8 +22,6 @@ using Level = Home::Level;
 using Outline = Home::Outline;
 using Space = Home::Space;
 
-constexpr double kPi = 3.14159265358979323846;
-
 /// World from the model frame. Sweet Home 3D turns the model, fitted to its size and centred, by
 /// its pitch or roll, then by its angle; in x right, y up, z to the front.
 Eigen::Affine3f worldFromModel(const Home& home, const Item& item, const SurfaceMesh& mesh) {
@@ -227,7 +225,7 @@ void addLamps(const ModelInfo& info, const Placed& placed, std::vector<RoomLight
   if (placed.item->power <= 0) return;
   for (const ModelLight& lamp : info.lights) {
     // Of the same intensity whatever its size; the examples have power .5.
-    constexpr float kIntensity = 2.4f, kPiF = float(kPi);
+    constexpr float kIntensity = 2.4f, kPiF = float(M_PI);
     RoomLight light;
     light.centre = placed.world_from_model * lamp.centre;
     // The shade is what shines, as in furnished rooms.
@@ -306,7 +304,7 @@ std::vector<RoomLight> lightsInSight(const Room& room) {
     const Vector3f origin(p.x(), p.y(), .2f + 1.8f * z);
     if (!isFree(room, origin, .05f)) continue;
     for (int i = 0; i < kRays; ++i) {
-      const float cosine = 2 * uniform() - 1, turn = 2 * float(kPi) * uniform();
+      const float cosine = 2 * uniform() - 1, turn = 2 * float(M_PI) * uniform();
       const float sine = std::sqrt(1 - cosine * cosine);
       origins.push_back(room.world_from_room * origin);
       directions.emplace_back(sine * std::cos(turn), sine * std::sin(turn), cosine);
