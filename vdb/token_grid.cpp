@@ -114,3 +114,6 @@ std::vector<Coord> activeCoords(const TokenMask& mask) {
 }
 
 }  // namespace vdbc
+
+template class openvdb::tree::Tree<vdbc::TokenMask::RootNodeType>;
+template class openvdb::tree::Tree<vdbc::TokenIndexTree::RootNodeType>;
