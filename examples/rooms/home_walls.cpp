@@ -11,9 +11,6 @@ namespace {
 
 using Eigen::Vector2d;
 using Eigen::Vector3d;
-using Finish = Home::Finish;
-using Item = Home::Item;
-using Wall = Home::Wall;
 using Baseboard = Home::Baseboard;
 
 /// Upper and lower edge of an SVG path with the commands M, v, h, a and z, which is all that the
@@ -66,7 +63,7 @@ std::optional<std::pair<double, double>> shapeSpan(const std::string& path, doub
   return std::pair(std::clamp(low, 0., 1.), std::clamp(high, 0., 1.));
 }
 
-Hole holeOf(const Item& item, double level_elevation) {
+Hole holeOf(const Home::Item& item, double level_elevation) {
   Hole hole;
   hole.centre = item.place, hole.axis = {std::cos(item.angle), std::sin(item.angle)};
   const bool is_round = item.cut_shape.find('a') != std::string::npos;
@@ -88,7 +85,7 @@ struct WallLines {
   std::vector<Vector2d> left, right;
 };
 
-WallLines unjoined(const Wall& wall) {
+WallLines unjoined(const Home::Wall& wall) {
   WallLines lines;
   const Vector2d chord = wall.end - wall.start, d = chord.normalized();
   const double half = wall.thickness / 2;
@@ -121,13 +118,13 @@ Vector2d corner(const Vector2d& p, const Vector2d& d, const Vector2d& q, const V
 }
 
 /// Mitres one end of `wall` with the neighbour that names it: the outer lines meet, the inner too.
-void joinEnd(const std::vector<Wall>& walls, const std::vector<WallLines>& lines, size_t index,
-             bool at_end, WallLines* joined) {
-  const Wall& wall = walls[index];
+void joinEnd(const std::vector<Home::Wall>& walls, const std::vector<WallLines>& lines,
+             size_t index, bool at_end, WallLines* joined) {
+  const Home::Wall& wall = walls[index];
   const std::string& other_id = at_end ? wall.at_end : wall.at_start;
   if (other_id.empty()) return;
-  const auto other =
-      std::find_if(walls.begin(), walls.end(), [&](const Wall& w) { return w.id == other_id; });
+  const auto other = std::find_if(walls.begin(), walls.end(),
+                                  [&](const Home::Wall& w) { return w.id == other_id; });
   if (other == walls.end() || other->level != wall.level || &*other == &wall) return;
   const Vector2d mine = at_end ? wall.end : wall.start;
   const bool by_start = other->at_start == wall.id, by_end = other->at_end == wall.id;
@@ -181,7 +178,7 @@ std::vector<std::array<double, 4>> gapsBetween(const Stretch& s, const Vector2d 
 void addSide(const Stretch& s, bool left, FaceBuilder* faces) {
   const Vector2d a = left ? s.left[0] : s.right[0], b = left ? s.left[1] : s.right[1];
   const Vector2d outward = leftOf(s.direction()) * (left ? 1 : -1);
-  const Finish& finish = (left ? s.wall->left : s.wall->right).finish;
+  const Home::Finish& finish = (left ? s.wall->left : s.wall->right).finish;
   std::vector<double> cuts{0, 1};
   for (const Hole& hole : s.holes)
     for (const Hole::Cut& cut : hole.cuts) {
@@ -209,7 +206,7 @@ void addSide(const Stretch& s, bool left, FaceBuilder* faces) {
 }
 
 /// The faces inside a hole, from one side of the wall to the other.
-void addReveal(const Stretch& s, const Hole& hole, const Finish& finish, FaceBuilder* faces) {
+void addReveal(const Stretch& s, const Hole& hole, const Home::Finish& finish, FaceBuilder* faces) {
   const auto at = [&](bool left, double x) {  // share of the side's length, and the place
     const Vector2d a = left ? s.left[0] : s.right[0], b = left ? s.left[1] : s.right[1];
     const double t = std::clamp((x - hole.x(a)) / (hole.x(b) - hole.x(a)), 0., 1.);
@@ -282,10 +279,10 @@ void addBaseboard(const Stretch& s, bool left, FaceBuilder* faces) {
 
 std::vector<Stretch> stretchesOf(const Home& home) {
   std::vector<WallLines> lines;
-  for (const Wall& wall : home.walls) lines.push_back(unjoined(wall));
+  for (const Home::Wall& wall : home.walls) lines.push_back(unjoined(wall));
   std::vector<Stretch> stretches;
   for (size_t i = 0; i < home.walls.size(); ++i) {
-    const Wall& wall = home.walls[i];
+    const Home::Wall& wall = home.walls[i];
     WallLines joined = lines[i];
     joinEnd(home.walls, lines, i, false, &joined);
     joinEnd(home.walls, lines, i, true, &joined);
@@ -310,7 +307,7 @@ std::vector<Stretch> stretchesOf(const Home& home) {
 
 std::vector<WallOpening> cutOpenings(const Home& home, std::vector<Stretch>* stretches) {
   std::vector<WallOpening> openings;
-  for (const Item& item : home.items) {
+  for (const Home::Item& item : home.items) {
     if (!item.is_opening) continue;
     WallOpening opening{&item, holeOf(item, home.levels[size_t(item.level)].elevation)};
     const Hole& hole = opening.hole;
@@ -345,7 +342,7 @@ void addStretch(const Stretch& s, FaceBuilder* faces) {
   addSide(s, false, faces);
   addBaseboard(s, true, faces);
   addBaseboard(s, false, faces);
-  const Finish& finish = s.wall->left.finish;
+  const Home::Finish& finish = s.wall->left.finish;
   const auto top = [&](const Vector2d& p) { return lifted(p, s.topAt(p)); };
   faces->add({top(s.left[0]), top(s.left[1]), top(s.right[1]), top(s.right[0])}, Vector3d::UnitZ(),
              finish);

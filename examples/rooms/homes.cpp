@@ -17,14 +17,13 @@ using Eigen::Vector2d;
 using Eigen::Vector2f;
 using Eigen::Vector3d;
 using Eigen::Vector3f;
-using Item = Home::Item;
 using Level = Home::Level;
 using Outline = Home::Outline;
 using Space = Home::Space;
 
 /// World from the model frame. Sweet Home 3D turns the model, fitted to its size and centred, by
 /// its pitch or roll, then by its angle; in x right, y up, z to the front.
-Eigen::Affine3f worldFromModel(const Home& home, const Item& item, const SurfaceMesh& mesh) {
+Eigen::Affine3f worldFromModel(const Home& home, const Home::Item& item, const SurfaceMesh& mesh) {
   Eigen::AlignedBox3d box;
   for (const Vector3f& v : mesh.mesh.vertices) box.extend(v.cast<double>());
   Eigen::Matrix3d upright, world;
@@ -48,7 +47,7 @@ Eigen::Affine3f worldFromModel(const Home& home, const Item& item, const Surface
 }
 
 /// The model in the item's own colours: one for all of it but its glass, or some materials'.
-SurfaceMesh coloured(const SurfaceMesh& mesh, const Item& item) {
+SurfaceMesh coloured(const SurfaceMesh& mesh, const Home::Item& item) {
   SurfaceMesh result = mesh;
   for (Material& material : result.materials) {
     const auto named = item.material_colours.find(material.name);
@@ -62,7 +61,7 @@ SurfaceMesh coloured(const SurfaceMesh& mesh, const Item& item) {
 
 /// An item where it stands.
 struct Placed {
-  const Item* item = nullptr;
+  const Home::Item* item = nullptr;
   Eigen::Affine3f world_from_model = Eigen::Affine3f::Identity();
   Eigen::AlignedBox3f box;  // world
 };
@@ -93,7 +92,7 @@ struct Plan {
       if (space.ceiling_visible && elevation(space.level) >= elevation(level) &&
           isInside(space.outline, p))
         return true;
-    for (const Item& item : home.items) {
+    for (const Home::Item& item : home.items) {
       const Vector2d axis(std::cos(item.angle), std::sin(item.angle)), from = p - item.place;
       if (item.size.head<2>().minCoeff() > 1.5 && std::abs(axis.dot(from)) < item.size.x() / 2 &&
           std::abs(cross(axis, from)) < item.size.y() / 2 &&
@@ -110,7 +109,7 @@ struct Plan {
     });
   }
 
-  bool holds(const Space& space, const Item& item) const {
+  bool holds(const Space& space, const Home::Item& item) const {
     return elevation(item.level) == elevation(space.level) && isInside(space.outline, item.place);
   }
 
@@ -132,7 +131,7 @@ struct Plan {
   std::vector<const Space*> furnishedRooms() const {
     std::vector<const Space*> furnished;
     for (const Space* space : rooms)
-      if (std::count_if(home.items.begin(), home.items.end(), [&](const Item& item) {
+      if (std::count_if(home.items.begin(), home.items.end(), [&](const Home::Item& item) {
             return !item.is_opening && holds(*space, item);
           }) >= 2)
         furnished.push_back(space);
@@ -195,7 +194,7 @@ bool isWindow(const ModelInfo& info, const SurfaceMesh& mesh) {
 /// Outside light behind a window: the sky to look at, and a light of the window's size before it.
 void addDaylight(const Plan& plan, const WallOpening& opening, FaceBuilder* faces,
                  std::vector<RoomLight>* lights) {
-  const Item& item = *opening.item;
+  const Home::Item& item = *opening.item;
   const Vector2d across = leftOf(opening.hole.axis);
   const bool is_back_in = plan.isIndoors(item.level, item.place + (opening.back + .3) * across);
   const bool is_front_in = plan.isIndoors(item.level, item.place + (opening.front - .3) * across);
@@ -253,7 +252,7 @@ Built build(const AssetLibrary& assets, const Plan& plan, int level) {
       addDaylight(plan, opening, &faces, &built.lights);
   built.surface = std::move(faces.surface);
   built.is_shell.assign(built.surface.mesh.triangles.size(), 1);
-  for (const Item& item : plan.home.items) {
+  for (const Home::Item& item : plan.home.items) {
     if (!levels.count(item.level)) continue;
     const SurfaceMesh mesh = coloured(*assets.mesh(item.model), item);
     Placed placed{&item, worldFromModel(plan.home, item, mesh), {}};
