@@ -1,5 +1,7 @@
 #include "vdb/grid_instances.h"
 
+template class openvdb::tree::Tree<vdbc::TokenMask::RootNodeType>;
+template class openvdb::tree::Tree<vdbc::TokenIndexTree::RootNodeType>;
 template class openvdb::tree::Tree<vdbc::FloatTree::RootNodeType>;
 template class openvdb::tree::Tree<vdbc::BoolTree::RootNodeType>;
 template class openvdb::tree::Tree<vdbc::Vec3STree::RootNodeType>;

@@ -114,6 +114,3 @@ std::vector<Coord> activeCoords(const TokenMask& mask) {
 }
 
 }  // namespace vdbc
-
-template class openvdb::tree::Tree<vdbc::TokenMask::RootNodeType>;
-template class openvdb::tree::Tree<vdbc::TokenIndexTree::RootNodeType>;
