@@ -508,7 +508,7 @@ CompleterStep completerStep(const CompleterConfig& config, const CompletionSampl
 
 namespace {
 
-constexpr int kMaxSide = 8192;  // nodes
+constexpr int kMaxSampleSide = 8192;  // nodes
 
 // What was seen as tensors NAME.box [7] (level, corners), NAME.filled and NAME.empty [n, 3].
 void addSeen(const SeenSpace& s, const std::string& name, TensorFile* file) {
@@ -533,8 +533,8 @@ SeenSpace readSeen(const TensorFile& file, const std::string& name, const std::s
   s.level = b[0];
   s.box = CoordBBox(Coord(b[1], b[2], b[3]), Coord(b[4], b[5], b[6]));
   for (int i = 0; i < 3; ++i)
-    require(b[4 + i] >= b[1 + i] && int64_t(b[4 + i]) - b[1 + i] < kMaxSide, "readSample: ", path,
-            ": expected a box of at most ", kMaxSide, " nodes a side");
+    require(b[4 + i] >= b[1 + i] && int64_t(b[4 + i]) - b[1 + i] < kMaxSampleSide,
+            "readSample: ", path, ": expected a box of at most ", kMaxSampleSide, " nodes a side");
   for (auto [part, mask] :
        {std::pair<const char*, TokenMask*>{".filled", &s.filled}, {".empty", &s.empty}}) {
     const Tensor coords = get(part);

@@ -23,7 +23,6 @@
 namespace vdbc {
 namespace {
 
-constexpr uint64_t kMaxPixels = uint64_t(1) << 28;
 // No codec of OpenEXR packs a picture more tightly: where a header claims so, take no memory for
 // it.
 constexpr uint64_t kMaxPixelsPerByte = 2048;
@@ -113,8 +112,8 @@ struct ExrFile::Impl {
 
   void requirePixels(const Imath::Box2i& window, const char* which) const {
     const int64_t w = widthOf(window), h = heightOf(window);
-    require(w > 0 && h > 0 && uint64_t(w) <= kMaxPixels && uint64_t(h) <= kMaxPixels &&
-                uint64_t(w) * uint64_t(h) <= kMaxPixels &&
+    require(w > 0 && h > 0 && uint64_t(w) <= kMaxImagePixels && uint64_t(h) <= kMaxImagePixels &&
+                uint64_t(w) * uint64_t(h) <= kMaxImagePixels &&
                 uint64_t(w) * uint64_t(h) / kMaxPixelsPerByte <= stream.size(),
             operation, ": ", name, ": ", which, " window of ", w, " x ", h, " pixels in ",
             stream.size(), " bytes (expected at most 2^28, and a file to match)");

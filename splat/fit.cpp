@@ -15,7 +15,7 @@ namespace {
 
 constexpr float kColourKnee = .05f;  // residuals beyond count linearly
 constexpr float kDepthKnee = .02f;   // share of the depth
-constexpr float kAlphaWeight = .1f, kDepthWeight = .02f;
+constexpr float kAlphaLoss = .1f, kDepthLoss = .02f;
 constexpr float kBeta1 = .9f, kBeta2 = .99f;
 // Adam's rates at the start; they fall to a tenth. Means: in units of a Gaussian's largest sigma.
 constexpr float kMeanRate = .08f, kScaleRate = .1f, kRotationRate = .005f, kOpacityRate = .05f,
@@ -80,10 +80,10 @@ Derivatives derivativesOf(const Target& t, const RasterOutput& r, const Exposure
         d.colour.data[3 * i + c] =
             t.weight[i] * e.gain[int(c)] * error / std::sqrt(1 + scaled * scaled);
       }
-      d.alpha.data[i] = -2 * kAlphaWeight * t.weight[i] * (1 - r.alpha.data[i]);
+      d.alpha.data[i] = -2 * kAlphaLoss * t.weight[i] * (1 - r.alpha.data[i]);
       if (t.depth[i] > 0 && r.alpha.data[i] > .5f) {
         const float error = (r.depth.data[i] - t.depth[i]) / (t.depth[i] * kDepthKnee);
-        d.depth.data[i] = kDepthWeight / t.depth[i] * error / std::sqrt(1 + error * error);
+        d.depth.data[i] = kDepthLoss / t.depth[i] * error / std::sqrt(1 + error * error);
       }
     }
   });

@@ -7,6 +7,8 @@
 
 namespace vdbc {
 
+constexpr uint64_t kMaxGaussianBytes = uint64_t(1) << 38;  // of a file
+
 /// What other programs call the opacity-compensated low pass, and its absence.
 constexpr const char *kAntialiasedMode = "mip", *kDefaultMode = "default";
 inline const char* renderMode(const Gaussians& g) {

@@ -1,9 +1,13 @@
 #pragma once
 // Float images and the metrics PSNR and SSIM.
 #include <cstddef>
+#include <cstdint>
 #include <vector>
 
 namespace vdbc {
+
+/// Pictures beyond these are refused before they are read.
+constexpr uint64_t kMaxImagePixels = uint64_t(1) << 28, kMaxImageBytes = uint64_t(1) << 32;
 
 /// Interleaved float image, row-major, [height, width, channels].
 struct Image {

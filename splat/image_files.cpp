@@ -17,8 +17,6 @@
 namespace vdbc {
 namespace {
 
-constexpr uint64_t kMaxPixels = uint64_t(1) << 28;
-constexpr uint64_t kMaxFileBytes = uint64_t(1) << 32;
 // No deflate stream expands more than 1032-fold (zlib's technical notes), and a Huffman-coded JPEG
 // spends at least one bit on each 8 x 8 block of each component (at most 4 x 4 pixels of luminance
 // per chroma block): a header that promises more than this lies, and no memory is taken for it.
@@ -88,7 +86,7 @@ bool startPng(png_structp png, png_infop info, PngSource* source, Want want, Sam
   int bits = 0, type = 0;
   png_get_IHDR(png, info, &width, &height, &bits, &type, nullptr, nullptr, nullptr);
   *grey16 = type == PNG_COLOR_TYPE_GRAY && bits == 16;
-  if (uint64_t(width) * height > kMaxPixels) png_error(png, "more than 2^28 pixels");
+  if (uint64_t(width) * height > kMaxImagePixels) png_error(png, "more than 2^28 pixels");
   if (want == Want::kRgba8) {
     png_set_expand(png);
     png_set_scale_16(png);
@@ -236,7 +234,7 @@ Samples decodeJpeg(const Encoded& from, Want want) {
   h.errors.base.emit_message = onJpegMessage;
   from.require(startJpeg(&h.jpeg, &h.errors, from), "corrupt JPEG: ", h.errors.message);
   const uint64_t pixels = uint64_t(h.jpeg.image_width) * h.jpeg.image_height;
-  from.require(pixels <= kMaxPixels, "more than 2^28 pixels (", h.jpeg.image_width, " x ",
+  from.require(pixels <= kMaxImagePixels, "more than 2^28 pixels (", h.jpeg.image_width, " x ",
                h.jpeg.image_height, ")");
   from.require(pixels / kMaxJpegPixelsPerByte <= from.size, "corrupt JPEG: ", from.size,
                " bytes are too few for ", h.jpeg.image_width, " x ", h.jpeg.image_height,
@@ -301,13 +299,13 @@ std::vector<uint8_t> decodeRgba(const char* operation, const std::string& name, 
 
 Image readImage(const std::string& path) {
   constexpr const char* kOperation = "readImage";
-  const std::vector<uint8_t> bytes = readFile(kOperation, path, kMaxFileBytes);
+  const std::vector<uint8_t> bytes = readFile(kOperation, path, kMaxImageBytes);
   return decodeImage(kOperation, path, bytes.data(), bytes.size());
 }
 
 std::vector<uint16_t> readPng16(const std::string& path, int* width, int* height) {
   constexpr const char* kOperation = "readPng16";
-  const std::vector<uint8_t> bytes = readFile(kOperation, path, kMaxFileBytes);
+  const std::vector<uint8_t> bytes = readFile(kOperation, path, kMaxImageBytes);
   const Samples raw = decode({kOperation, path, bytes.data(), bytes.size()}, Want::kGrey16);
   *width = raw.width, *height = raw.height;
   std::vector<uint16_t> values(size_t(raw.width) * size_t(raw.height));

@@ -51,7 +51,7 @@ constexpr int kRounds = 60;
 
 constexpr int kRimParts = 2;           // along both sides of a flat disc that meets what was seen
 constexpr float kRimOverlap = 1.25f;   // of these
-constexpr float kFill = .6f;           // of how neighbours lie, added to a voxel's Gaussian
+constexpr float kSpreadShare = .6f;    // of how neighbours lie, added to a voxel's Gaussian
 constexpr float kLeastOpacity = .95f;  // of it
 constexpr float kTileSigmas = 2.6f;    // by which tiles are widened to close up
 
@@ -405,7 +405,7 @@ void fitColours(const Gaussians& discs, const PointCells& disc_cells, float voxe
 Blob drawn(const Voxel& v, float voxel_m) {
   if (!v.plane) {
     Blob b = v.blob;
-    b.covariance += kFill * v.spread;
+    b.covariance += kSpreadShare * v.spread;
     b.opacity = std::max(b.opacity, kLeastOpacity);
     return b;
   }

@@ -17,9 +17,8 @@
 namespace vdbc {
 namespace {
 
-constexpr uint64_t kMaxFileBytes = uint64_t(1) << 38;
 constexpr float kMaxLogit = 15.f;  // 3DGS tools take the sigmoid in float
-constexpr size_t kMaxHeaderBytes = 128 << 10;
+constexpr size_t kMaxPlyHeaderBytes = 128 << 10;
 
 struct PlyProperty {
   std::string name, type;
@@ -85,7 +84,7 @@ void addProperty(const std::string& line, const std::string& prefix, PlyHeader* 
 PlyHeader parsePlyHeader(const std::vector<uint8_t>& bytes, const std::string& path) {
   const std::string prefix = "readPly: " + path + ": ";
   const auto* begin = reinterpret_cast<const char*>(bytes.data());
-  const std::string_view text(begin, std::min(bytes.size(), kMaxHeaderBytes));
+  const std::string_view text(begin, std::min(bytes.size(), kMaxPlyHeaderBytes));
   PlyHeader header;
   bool format_seen = false;
   for (size_t line_number = 0;; ++line_number) {
@@ -245,7 +244,7 @@ double plyStep(const Gaussians& g) {
 }
 
 Gaussians readPly(const std::string& path) {
-  const std::vector<uint8_t> bytes = readFile("readPly", path, kMaxFileBytes);
+  const std::vector<uint8_t> bytes = readFile("readPly", path, kMaxGaussianBytes);
   const PlyHeader header = parsePlyHeader(bytes, path);
   size_t offset = header.bytes;
   const PlyElement* vertex = nullptr;

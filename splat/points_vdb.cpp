@@ -24,7 +24,6 @@
 namespace vdbc {
 namespace {
 
-constexpr uint64_t kMaxFileBytes = uint64_t(1) << 38;
 constexpr const char* kModeKey = "splat_render_mode";  // in a grid's metadata
 constexpr int kMaxShSlots = 16;  // of GS_SPH_R in files by others: room for degree 3
 
@@ -115,8 +114,9 @@ bool fitHalf(const Gaussians& g, const std::vector<int64_t>& rows) {
   });
 }
 
-void fillLeaf(const Gaussians& g, const Provenance& provenance, const std::vector<int64_t>& sorted,
-              const LeafRows& range, const openvdb::math::Transform& transform) {
+void fillGaussianLeaf(const Gaussians& g, const Provenance& provenance,
+                      const std::vector<int64_t>& sorted, const LeafRows& range,
+                      const openvdb::math::Transform& transform) {
   PointLeaf& leaf = *range.leaf;
   auto position = writeHandle<Vec3f, PositionCodec>(leaf, "P");
   openvdb::points::AttributeWriteHandle<Vec3f> scale(leaf.attributeArray("scale"));
@@ -188,7 +188,7 @@ PointTree::Ptr buildPointTree(const Gaussians& g, const Provenance& provenance,
   openvdb::points::appendAttribute<float, ExactCodec>(*tree, "probability");
   openvdb::points::appendGroup(*tree, "completed");
   tbb::parallel_for(size_t(0), leaves.size(), [&, &sorted = sorted, &leaves = leaves](size_t l) {
-    fillLeaf(g, provenance, sorted, leaves[l], transform);
+    fillGaussianLeaf(g, provenance, sorted, leaves[l], transform);
   });
   openvdb::points::compactAttributes(*tree);
   return tree;
@@ -402,7 +402,7 @@ void writePointsVdb(const Gaussians& g, const Provenance& provenance, const std:
 }
 
 Gaussians readPointsVdb(const std::string& path, Provenance* provenance) {
-  const openvdb::GridPtrVec grids = readVdb("readPointsVdb", path, kMaxFileBytes).grids;
+  const openvdb::GridPtrVec grids = readVdb("readPointsVdb", path, kMaxGaussianBytes).grids;
   try {
     return gatherPoints(*findSplats(grids, path), path, provenance);
   } catch (const Error&) {

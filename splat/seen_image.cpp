@@ -8,13 +8,14 @@
 #include <tuple>
 
 #include "vdb/error.h"
+#include "vdb/median.h"
 
 namespace vdbc {
 namespace {
 
 // Shares of the image's width, so that they hold at every resolution.
 constexpr double kHoleReach = .09;      // how far planes are continued into holes of the depth
-constexpr double kFrame = .006;         // along the image's border holes stay as they are
+constexpr double kBorder = .006;        // along the image's border holes stay as they are
 constexpr float kHoleColour = 1.f;      // sum of colour steps that continuing a plane may cross
 constexpr size_t kMostNeighbours = 16;  // views that a view is compared with
 constexpr int kLeastAlike = 2;          // of 8 neighbours
@@ -75,13 +76,6 @@ Sums SumTable::over(int x0, int y0, int x1, int y1) const {
 }
 
 namespace {
-
-double median(std::vector<double>* values) {
-  if (values->empty()) return 0;
-  const auto middle = values->begin() + std::ptrdiff_t(values->size() / 2);
-  std::nth_element(values->begin(), middle, values->end());
-  return *middle;
-}
 
 // Median residual of planes through 5 x 5 pixels, all measured; 22 degrees of freedom each.
 double depthNoise(const SumTable& table) {
@@ -163,7 +157,7 @@ struct Front {
 // Planes around holes of the depth go on into them, along like colours first.
 void continuePlanes(const SumTable& table, SeenImage* image) {
   const int w = image->width(), h = image->height();
-  const int reach = int(kHoleReach * w), frame = int(kFrame * w);
+  const int reach = int(kHoleReach * w), frame = int(kBorder * w);
   const Image& colour = image->view.colour;
   const auto later = [](const Front& a, const Front& b) {
     return std::tie(a.cost, a.y, a.x) > std::tie(b.cost, b.y, b.x);

@@ -90,7 +90,7 @@ struct Measured {
 };
 
 template <typename Carve>
-void run(benchmark::State& state, float voxel_m, const Carve& carve_views) {
+void runCarving(benchmark::State& state, float voxel_m, const Carve& carve_views) {
   const Measured m(voxel_m);
   const tbb::global_control one(tbb::global_control::max_allowed_parallelism, 1);
   double filled = 0, empty = 0;
@@ -110,9 +110,11 @@ SeenSpace voxelDriven(const VoxelFrame& frame, const std::vector<DepthView>& vie
   return carve(frame, views, settings, progress);
 }
 
-void carveVoxelDriven(benchmark::State& state, float voxel_m) { run(state, voxel_m, voxelDriven); }
+void carveVoxelDriven(benchmark::State& state, float voxel_m) {
+  runCarving(state, voxel_m, voxelDriven);
+}
 void carveTraversal(benchmark::State& state, float voxel_m) {
-  run(state, voxel_m, carveByTraversal);
+  runCarving(state, voxel_m, carveByTraversal);
 }
 
 BENCHMARK_CAPTURE(carveVoxelDriven, 10cm, 0.1f)

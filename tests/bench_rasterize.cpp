@@ -202,7 +202,7 @@ Cost costOf(const RasterWork& w, const Row& row, bool both) {
   return c;
 }
 
-void run(benchmark::State& state, const Row& row, bool both, bool everything) {
+void runRow(benchmark::State& state, const Row& row, bool both, bool everything) {
   tbb::global_control limit(tbb::global_control::max_allowed_parallelism, kThreads);
   const Gaussians g = inLeafOrder(roomScene(row.n));
   const Camera camera = roomCamera(row.width, row.height);
@@ -274,7 +274,7 @@ void run(benchmark::State& state, const Row& row, bool both, bool everything) {
   const auto add = [](const char* name, const Row& row, bool both, bool everything) {
     const std::string full = std::string("rasterize/") + name + "/" + std::to_string(row.n) + "/" +
                              std::to_string(row.width) + "x" + std::to_string(row.height);
-    benchmark::RegisterBenchmark(full.c_str(), run, row, both, everything)
+    benchmark::RegisterBenchmark(full.c_str(), runRow, row, both, everything)
         ->Unit(benchmark::kMillisecond)
         ->UseRealTime();
   };

@@ -10,8 +10,6 @@
 namespace vdbc {
 namespace {
 
-const std::string kWeights = VDBC_SOURCE_DIR "/weights/indoor";
-
 // Decibels of each view, the scene's Gaussians over black.
 std::vector<double> viewPsnr(const std::vector<View>& views, const Place& place,
                              const Encoder& encoder, const SceneSettings& settings) {

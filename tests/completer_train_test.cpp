@@ -10,6 +10,7 @@
 
 #include "encoder/trainer.h"
 #include "encoder/weights.h"
+#include "tests/expect_error.h"
 #include "tests/files.h"
 #include "tests/toy_completer.h"
 
@@ -156,11 +157,6 @@ TEST_F(SampleFile, BadFilesThrow) {
 }
 
 // --- training ------------------------------------------------------------------------------------
-
-class StopAtHalf : public Progress {
- public:
-  bool wasInterrupted(int percent = -1) override { return percent == 50; }
-};
 
 using CompleterResume = SampleFile;
 const std::vector<float> kOneColour = {1, -1, 0, 0, 0, 0, 0, 0};

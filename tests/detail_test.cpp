@@ -19,7 +19,7 @@ using Eigen::Vector3d;
 using Eigen::Vector3f;
 using Eigen::Vector4f;
 
-const Vector3d kRoom(4.2, 3.4, 2.6);  // metres, from the world's origin
+const Vector3d kRoomSides(4.2, 3.4, 2.6);  // metres, from the world's origin
 
 /// Stripes on the floor, a checkerboard on the wall at x = 0, plain elsewhere.
 Vector3f colourAt(const Vector3d& p) {
@@ -50,7 +50,7 @@ View viewFrom(const Vector3d& eye, const Vector3d& target, int width = 96, int h
       double z = 1e9;
       for (int axis = 0; axis < 3; ++axis)
         if (ray[axis] != 0)
-          z = std::min(z, ((ray[axis] > 0 ? kRoom[axis] : 0) - eye[axis]) / ray[axis]);
+          z = std::min(z, ((ray[axis] > 0 ? kRoomSides[axis] : 0) - eye[axis]) / ray[axis]);
       v.depth[size_t(y) * size_t(width) + size_t(x)] = float(z);
       Vector3d p = eye + z * ray;
       for (int axis = 0; axis < 3; ++axis)
@@ -85,7 +85,7 @@ double psnrFrom(const Gaussians& g, const View& v) {
 /// Metres from the nearest face of the room; negative outside of it.
 double insideBy(const Vector3f& mean) {
   const Vector3d p = mean.cast<double>();
-  return std::min(p.minCoeff(), (kRoom - p).minCoeff());
+  return std::min(p.minCoeff(), (kRoomSides - p).minCoeff());
 }
 
 TEST(Detail, DiscsLieFlatOnWhatWasMeasured) {
@@ -283,7 +283,7 @@ TEST(Join, SeenPlanesGoOnAsDiscsInThem) {
 /// The plain wall at x = 4.2, of which one view saw a part, decoded whole and farther on, in
 /// another colour.
 struct HalfSeenWall {
-  std::vector<View> views = {viewFrom({1.2, 1.7, 1.3}, {kRoom.x(), .4, 1.3})};
+  std::vector<View> views = {viewFrom({1.2, 1.7, 1.3}, {kRoomSides.x(), .4, 1.3})};
   Vector3f seen_colour = {.6f, .5f, .4f}, generated_colour = {.75f, .5f, .3f};
   Gaussians discs;
   SplatScene scene;
@@ -291,12 +291,12 @@ struct HalfSeenWall {
 
   explicit HalfSeenWall(double seconds = .2) : discs(discsOf(views, seconds)) {
     for (const Vector3f& p : discs.mean)
-      if (std::abs(p.x() - kRoom.x()) < .05 && std::abs(p.z() - 1.3) < .5)
+      if (std::abs(p.x() - kRoomSides.x()) < .05 && std::abs(p.z() - 1.3) < .5)
         rim = std::max(rim, p.y());
     Joined j;
     for (float y = .05f; y < 5; y += .1f)
       for (float z = .45f; z < 2.2f; z += .1f)
-        addVoxel({float(kRoom.x()) + .02f, y, z}, generated_colour, y > rim + .1f, &j.decoded,
+        addVoxel({float(kRoomSides.x()) + .02f, y, z}, generated_colour, y > rim + .1f, &j.decoded,
                  &j.provenance);
     scene = join(discs, j.decoded, j.provenance, 8, {views[0].camera}, {});
   }
@@ -321,7 +321,7 @@ TEST(Join, ContinuedPlanesAreLevel) {
     ++flat;
     EXPECT_LT(sigma[2], .02f);
     EXPECT_GT(std::abs(normal.x()), std::cos(.5f * float(M_PI) / 180));
-    EXPECT_NEAR(g.mean[i].x(), kRoom.x() + .03, .005);  // behind what was seen
+    EXPECT_NEAR(g.mean[i].x(), kRoomSides.x() + .03, .005);  // behind what was seen
   });
   EXPECT_GT(flat, 20u);
 }
@@ -341,7 +341,7 @@ TEST(Join, ColoursOfBothSidesMeetAndPartFartherOn) {
 
 TEST(Join, NoSeamAlongTheRimOfWhatWasSeen) {
   const HalfSeenWall wall;
-  const View other = viewFrom({1.5, wall.rim + .3, 1.3}, {kRoom.x(), wall.rim, 1.3});
+  const View other = viewFrom({1.5, wall.rim + .3, 1.3}, {kRoomSides.x(), wall.rim, 1.3});
   RasterSettings raster;
   raster.antialias = true;
   const RasterOutput seen = rasterize(wall.scene.gaussians, other.camera, raster);
@@ -369,7 +369,7 @@ TEST(Join, AGeneratedWallIsFewGaussiansOfTheLowestProbability) {
 
 TEST(Join, WhatCrossesASeenPlaneKeepsItsShape) {
   // Exactly on the plane of the plain wall, which a sheet of voxels crosses beyond its rim.
-  const std::vector<View> views = {viewFrom({1.2, 1.7, 1.3}, {kRoom.x(), .4, 1.3})};
+  const std::vector<View> views = {viewFrom({1.2, 1.7, 1.3}, {kRoomSides.x(), .4, 1.3})};
   const Gaussians discs = discsOf(views, 1e-9);
   std::vector<std::pair<Vector3f, bool>> voxels;
   for (float x = 3.95f; x < 4.5f; x += .1f)

@@ -20,7 +20,10 @@
 #include "encoder/trainer.h"
 #include "encoder/weights.h"
 #include "splat/rasterize_torch.h"
+#include "tests/expect_error.h"
+#include "tests/files.h"
 #include "tests/simple_room.h"
+#include "tests/toy_completer.h"
 #include "vdb/fit_volume.h"
 #include "vdb/frontier.h"
 
@@ -53,7 +56,7 @@ View nearWall(int side, float distance) {
   return view;
 }
 
-EncoderConfig toyConfig(int levels = 1) {
+EncoderConfig toyEncoder(int levels = 1) {
   EncoderConfig c;
   c.preset = "toy", c.voxel_m = .2f, c.levels = levels;
   c.patches_across = 4, c.patch_px = 8;
@@ -94,18 +97,6 @@ void saveNet(const EncoderNet& net, const std::string& path) {
   file.metadata["encoder"] = net.config.toJson();
   file.metadata["trained_on"] = "rooms:1-2";
   writeTensors(file, path);
-}
-
-double largestDifference(const Tensor& a, const Tensor& b) {
-  return (a - b).abs().max().item<double>();
-}
-
-std::string bytesOf(const std::string& path) {
-  std::ifstream in(path, std::ios::binary);
-  return {std::istreambuf_iterator<char>(in), {}};
-}
-void writeBytes(const std::string& bytes, const std::string& path) {
-  std::ofstream(path, std::ios::binary) << bytes;
 }
 
 class InFolder : public testing::Test {
@@ -314,7 +305,7 @@ TEST(EncoderGuide, AlphaOneIsPlainAttentionAndZeroTheGuideAlone) {  // section 3
 }
 
 TEST(EncoderGuide, ShareIsLearnedFromAHalfOrFixed) {  // section 3.2
-  EncoderConfig c = toyConfig();
+  EncoderConfig c = toyEncoder();
   const auto learned = makeNet(c, 1);
   EXPECT_EQ(learned->blocks[0]->alpha.sigmoid().item<float>(), .5f);
   EXPECT_TRUE(learned->blocks[0]->alpha.requires_grad());
@@ -335,7 +326,7 @@ TEST(EncoderGuide,
      CountsPixelsOfThePatchInTheToken) {  // section 3.2, against a loop over the pixels
   const std::vector<View> views = roomViews(2);
   for (int level : {1, 2}) {
-    const EncoderConfig c = toyConfig(level);
+    const EncoderConfig c = toyEncoder(level);
     const Observation o = observed(views, c);
     const EncoderInput in = encoderInput(views, o, c);
     Tensor counts = torch::zeros({o.tokens.size(level), o.patches});
@@ -366,7 +357,7 @@ TEST(EncoderGuide,
 TEST(EncoderInput, PatchesAreThePixelsWhereTheSizeDividesTheImage) {  // section 2.6
   const std::vector<View> views = roomViews(2);
   for (int across : {4, 8}) {
-    EncoderConfig c = toyConfig();
+    EncoderConfig c = toyEncoder();
     c.patches_across = across, c.patch_px = 64 / across;
     const int px = c.patch_px, rows = 48 / px;
     const EncoderInput in = encoderInput(views, observed(views, c), c);
@@ -391,7 +382,7 @@ TEST(EncoderInput, PatchesAreThePixelsWhereTheSizeDividesTheImage) {  // section
 TEST(EncoderInput, AnyPatchSizeRuns) {  // section 2.6
   const std::vector<View> views = roomViews(2);
   for (const auto& [across, px] : {std::pair<int, int>{1, 3}, {5, 7}, {14, 16}}) {
-    EncoderConfig c = toyConfig();
+    EncoderConfig c = toyEncoder();
     c.patches_across = across, c.patch_px = px;
     const Observation o = observed(views, c);
     const Tensor z = makeNet(c, 1)->encode(encoderInput(views, o, c)).mean;
@@ -402,7 +393,7 @@ TEST(EncoderInput, AnyPatchSizeRuns) {  // section 2.6
 
 TEST(EncoderNet, TheOrderOfViewsDoesNotMatter) {  // section 3.1
   torch::NoGradGuard no_grad;
-  const EncoderConfig c = toyConfig();
+  const EncoderConfig c = toyEncoder();
   const auto net = makeNet(c, 2);
   std::vector<View> views = roomViews(4);
   const VoxelFrame frame = frameOf(views, c.voxel_m);
@@ -424,7 +415,7 @@ TEST(EncoderNet, PermutedVoxelsGivePermutedLatents) {  // section 3.1
   torch::NoGradGuard no_grad;
   const std::vector<View> views = roomViews(3);
   for (int window : {32, 4096}) {
-    EncoderConfig c = toyConfig();
+    EncoderConfig c = toyEncoder();
     c.window = window;
     const auto net = makeNet(c, 3);
     const Observation o = observed(views, c);
@@ -455,7 +446,7 @@ TEST(EncoderNet, PermutedVoxelsGivePermutedLatents) {  // section 3.1
 
 TEST(EncoderNet, PatchesAreUpdatedFromTheNewVoxelTokens) {  // section 3.1, paper eq. 2
   torch::NoGradGuard no_grad;
-  const EncoderConfig c = toyConfig();
+  const EncoderConfig c = toyEncoder();
   const std::vector<View> views = roomViews(2);
   const EncoderInput in = encoderInput(views, observed(views, c), c);
   torch::manual_seed(6);
@@ -485,7 +476,7 @@ TEST(EncoderNet, PatchesAreUpdatedFromTheNewVoxelTokens) {  // section 3.1, pape
 
 TEST(EncoderNet, ImagesReachTheVoxelsAndVoxelsTheImages) {  // section 3.1
   torch::NoGradGuard no_grad;
-  const EncoderConfig c = toyConfig();
+  const EncoderConfig c = toyEncoder();
   const auto net = makeNet(c, 7);
   EXPECT_TRUE(net->blocks[0]->cross2 && net->blocks[1]->cross2);
   EXPECT_FALSE(net->blocks[2]->cross2) << "2-D tokens are dropped at the end";
@@ -500,7 +491,7 @@ TEST(EncoderNet, ImagesReachTheVoxelsAndVoxelsTheImages) {  // section 3.1
 }
 
 TEST(EncoderNet, NormaliseGivesEveryTokensGroupsUnitDeviation) {  // section 3.3
-  const EncoderConfig c = toyConfig();
+  const EncoderConfig c = toyEncoder();
   torch::manual_seed(8);
   const Tensor z = makeNet(c, 8)->normalise(3 + 2 * torch::randn({50, c.latent_dim}));
   const Tensor groups = z.view({50, c.latent_groups, -1});
@@ -511,7 +502,7 @@ TEST(EncoderNet, NormaliseGivesEveryTokensGroupsUnitDeviation) {  // section 3.3
 TEST(EncoderNet, GaussiansStayNearTheirSubLattice) {  // section 3.5
   torch::NoGradGuard no_grad;
   for (int per_axis : {1, 2, 6}) {
-    EncoderConfig c = toyConfig();
+    EncoderConfig c = toyEncoder();
     c.gaussians_per_voxel = per_axis * per_axis * per_axis;
     const auto net = makeNet(c, 9);
     net->gaussian_out->weight.mul_(300);  // far beyond what training gives
@@ -559,7 +550,7 @@ TEST(EncoderNet, AnyNumberOfGaussiansSharesTheLattice) {  // section 3.5: M
 
 TEST(EncoderNet, OctantsKeepTheirColours) {  // the way around the transformers
   torch::NoGradGuard no_grad;
-  EncoderConfig c = toyConfig();
+  EncoderConfig c = toyEncoder();
   c.gaussians_per_voxel = 8;
   const auto net = makeNet(c, 10);
   net->gaussian_out->weight.zero_();
@@ -636,7 +627,7 @@ class EncoderFile : public InFolder {
 };
 
 TEST_F(EncoderFile, OneSetOfWeightsServesAnyNumberOfViews) {  // section 2.1
-  const Encoder encoder = encoderOf(toyConfig());
+  const Encoder encoder = encoderOf(toyEncoder());
   for (size_t n : {1, 2, 4, 8, 12, 16}) {
     const std::vector<View> views = roomViews(n);
     const Observation o = observed(views, encoder.config());
@@ -652,7 +643,7 @@ TEST_F(EncoderFile, OneSetOfWeightsServesAnyNumberOfViews) {  // section 2.1
 }
 
 TEST_F(EncoderFile, EncodesConditionAndTargetWithTheSameUnchangedWeights) {  // section 3.8
-  const Encoder encoder = encoderOf(toyConfig());
+  const Encoder encoder = encoderOf(toyEncoder());
   const std::string hash = encoder.hash();
   const std::vector<View> few = roomViews(2), many = roomViews(6);
   const VoxelFrame frame = frameOf(few, encoder.config().voxel_m);
@@ -666,7 +657,7 @@ TEST_F(EncoderFile, EncodesConditionAndTargetWithTheSameUnchangedWeights) {  // 
 }
 
 TEST_F(EncoderFile, LoadsExactlyWhatWasSaved) {  // section 3.8
-  const EncoderConfig c = toyConfig();
+  const EncoderConfig c = toyEncoder();
   const Encoder encoder = encoderOf(c);
   EXPECT_EQ(encoder.config().toJson(), c.toJson());
   EXPECT_EQ(encoder.trainedOn(), "rooms:1-2");
@@ -700,7 +691,7 @@ TEST_F(EncoderFile, DecodesWhatWasSeenExactlyAndNothingIntoSeenAir) {  // sectio
   const std::vector<View> views = roomViews(3);
   for (int levels : {0, 1, 2})
     for (const float threshold : {.2f, .5f, 1.f}) {
-      const EncoderConfig c = toyConfig(levels);
+      const EncoderConfig c = toyEncoder(levels);
       const Encoder encoder = encoderOf(c);
       const Observation o = observed(views, c);
       Place place = encoder.encode(views, o, silent_);
@@ -744,7 +735,7 @@ TEST_F(EncoderFile, DecodesWhatWasSeenExactlyAndNothingIntoSeenAir) {  // sectio
 }
 
 TEST_F(EncoderFile, LowerThresholdsKeepMore) {  // section 3.4
-  const EncoderConfig c = toyConfig();
+  const EncoderConfig c = toyEncoder();
   const Encoder encoder = encoderOf(c);
   const std::vector<View> views = roomViews(2);
   const Observation o = observed(views, c);
@@ -767,7 +758,7 @@ TEST_F(EncoderFile, LowerThresholdsKeepMore) {  // section 3.4
 }
 
 TEST_F(EncoderFile, DecodesNoTokensToNoGaussians) {
-  const Encoder encoder = encoderOf(toyConfig());
+  const Encoder encoder = encoderOf(toyEncoder());
   Place nothing;
   nothing.seen = std::make_shared<SeenSpace>();
   nothing.dim = 16;
@@ -777,7 +768,7 @@ TEST_F(EncoderFile, DecodesNoTokensToNoGaussians) {
 }
 
 TEST_F(EncoderFile, BadFilesThrow) {
-  const EncoderConfig c = toyConfig();
+  const EncoderConfig c = toyEncoder();
   encoderOf(c);
   const std::string good = path("encoder.safetensors"), bad = path("bad.safetensors");
   const TensorFile file = readTensors(good);
@@ -816,14 +807,14 @@ TEST_F(EncoderFile, BadFilesThrow) {
     });
   const std::string bytes = bytesOf(good);
   for (size_t n = 0; n < bytes.size(); n += bytes.size() / 40) {
-    writeBytes(bytes.substr(0, n), bad);
+    writeBytes(bad, bytes.substr(0, n));
     EXPECT_THROW(Encoder{bad}, Error) << n;
   }
   EXPECT_NO_THROW(Encoder{good});
 }
 
 TEST(EncoderConfig, JsonRoundTripIsExact) {
-  for (const EncoderConfig& c : {EncoderConfig::small(), EncoderConfig::paper(), toyConfig(2)})
+  for (const EncoderConfig& c : {EncoderConfig::small(), EncoderConfig::paper(), toyEncoder(2)})
     EXPECT_EQ(EncoderConfig::fromJson(c.toJson(), "test").toJson(), c.toJson());
 }
 
@@ -862,7 +853,7 @@ class TensorFiles : public InFolder {
   }
   void writeHeader(const std::string& header, const std::string& data = "") const {
     const uint64_t length = header.size();
-    writeBytes(std::string(reinterpret_cast<const char*>(&length), 8) + header + data, path("bad"));
+    writeBytes(path("bad"), std::string(reinterpret_cast<const char*>(&length), 8) + header + data);
   }
 };
 
@@ -885,7 +876,7 @@ TEST_F(TensorFiles, EveryTruncationThrows) {
   writeTensors(sample(), path("file"));
   const std::string bytes = bytesOf(path("file"));
   for (size_t n = 0; n < bytes.size(); ++n) {
-    writeBytes(bytes.substr(0, n), path("cut"));
+    writeBytes(path("cut"), bytes.substr(0, n));
     EXPECT_THROW(readTensors(path("cut")), Error) << n << " of " << bytes.size() << " bytes";
   }
 }
@@ -898,7 +889,7 @@ TEST_F(TensorFiles, ACorruptHeaderThrowsErrorOrIsStillConsistent) {
     for (const size_t kind : {i % 6, (i + 1 + i / 6) % 6}) {
       std::string changed = bytes;
       changed[i] = "\0009\"-{\xff"[kind];
-      writeBytes(changed, path("bad"));
+      writeBytes(path("bad"), changed);
       try {
         readTensors(path("bad"));
       } catch (const Error&) {
@@ -923,14 +914,14 @@ TEST_F(TensorFiles, HostileHeadersThrow) {
     EXPECT_THROW(readTensors(path("bad")), Error) << header;
   }
   const uint64_t huge = ~uint64_t(0) - 4;
-  writeBytes(std::string(reinterpret_cast<const char*>(&huge), 8) + "{}", path("bad"));
+  writeBytes(path("bad"), std::string(reinterpret_cast<const char*>(&huge), 8) + "{}");
   EXPECT_THROW(readTensors(path("bad")), Error);
 }
 
 TEST_F(TensorFiles, AFailedWriteThrowsAndLeavesNothing) {
   EXPECT_THROW(writeTensors(sample(), path("no/such/folder")), Error);
   fs::create_directory(path("folder"));
-  writeBytes("x", path("folder/inside"));
+  writeBytes(path("folder/inside"), "x");
   EXPECT_THROW(writeTensors(sample(), path("folder")), Error) << "a folder is in the way";
   EXPECT_FALSE(fs::exists(path("folder.tmp")));
   TensorFile file;
@@ -1001,7 +992,7 @@ double firstLoss(EncoderConfig c, const std::vector<View>& views, float kl_weigh
 
 TEST(EncoderLoss, KlEqualsMonteCarlo) {  // sections 3.3 and 3.7
   torch::NoGradGuard no_grad;
-  const EncoderConfig c = toyConfig();
+  const EncoderConfig c = toyEncoder();
   const std::vector<View> views = roomViews(2);
   double kl;
   {
@@ -1022,7 +1013,7 @@ TEST(EncoderLoss, KlEqualsMonteCarlo) {  // sections 3.3 and 3.7
 }
 
 TEST(EncoderLoss, ImageTermIsTheMeanOverObservedPixelsAndChannels) {  // section 3.7
-  const EncoderConfig c = toyConfig(0);  // no splits: nothing else is random
+  const EncoderConfig c = toyEncoder(0);  // no splits: nothing else is random
   std::vector<View> views = roomViews(2);
   for (size_t i = 0; i < 900; ++i) views[1].depth[i] = 0;  // pixels that do not count
   const FirstStep step(views, c);
@@ -1051,7 +1042,7 @@ TEST(EncoderLoss, ImageTermIsTheMeanOverObservedPixelsAndChannels) {  // section
 }
 
 TEST(EncoderLoss, SplitTermIsTheCrossEntropyOfWhatIsKnown) {  // sections 3.4 and 3.7
-  const EncoderConfig c = toyConfig(1);
+  const EncoderConfig c = toyEncoder(1);
   const std::vector<View> views = roomViews(2);
   const double split = firstLoss(c, views, 0, 1) - firstLoss(c, views, 0, 0);
   const FirstStep step(views, c);
@@ -1077,7 +1068,7 @@ TEST(EncoderLoss, SplitTermIsTheCrossEntropyOfWhatIsKnown) {  // sections 3.4 an
 TEST(EncoderTraining, AStepLowersTheLossAtEveryLevel) {  // sections 2.3 and 3.7
   const std::vector<View> views = roomViews(2);
   for (int levels : {0, 1, 2}) {
-    const auto [before, after] = encoderStepLoss(toyConfig(levels), views, 15);
+    const auto [before, after] = encoderStepLoss(toyEncoder(levels), views, 15);
     EXPECT_TRUE(std::isfinite(before));
     EXPECT_LT(after, before) << levels << " levels";
   }
@@ -1116,12 +1107,6 @@ TEST(EncoderTraining, PaperPresetRunsAStep) {  // sections 3.5 and 3.7: M = 216,
   EXPECT_NE(before, after);
 }
 
-/// Asks to stop when half of the work is done.
-class StopAtHalf : public Progress {
- public:
-  bool wasInterrupted(int percent = -1) override { return percent == 50; }
-};
-
 class EncoderResume : public InFolder {};
 
 /// Four views of one room, others for each index.
@@ -1133,7 +1118,7 @@ std::vector<View> rotatedViews(uint64_t index) {
 }
 
 TEST_F(EncoderResume, AnInterruptedRunEndsAsAnUninterruptedOne) {  // section 3.7
-  const EncoderConfig c = toyConfig();
+  const EncoderConfig c = toyEncoder();
   const SceneSource validation = [](uint64_t) { return roomViews(6); };
   TrainSettings settings;
   settings.steps = 6, settings.warmup = 2, settings.validate_every = settings.checkpoint_every = 3;
@@ -1176,7 +1161,7 @@ std::vector<TrainLogRow> trainToy(TrainSettings settings, const std::string& fol
   std::vector<TrainLogRow> rows;
   Progress silent;
   trainEncoder(
-      toyConfig(), rotatedViews, 5, [](uint64_t) { return roomViews(6); }, 1, settings,
+      toyEncoder(), rotatedViews, 5, [](uint64_t) { return roomViews(6); }, 1, settings,
       [&](const TrainLogRow& row) { rows.push_back(row); }, silent);
   return rows;
 }

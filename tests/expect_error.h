@@ -1,11 +1,12 @@
 #pragma once
-// How functions are expected to fail.
+// How functions are expected to fail, and to be stopped.
 #include <gtest/gtest.h>
 
 #include <string>
 #include <vector>
 
 #include "vdb/error.h"
+#include "vdb/progress.h"
 
 namespace vdbc {
 
@@ -22,5 +23,11 @@ void expectError(const Attempt& attempt, const std::vector<std::string>& parts) 
       EXPECT_NE(message.find(part), std::string::npos) << message << "\nlacks " << part;
   }
 }
+
+/// Asks to stop when half of the work is done.
+class StopAtHalf : public Progress {
+ public:
+  bool wasInterrupted(int percent = -1) override { return percent == 50; }
+};
 
 }  // namespace vdbc

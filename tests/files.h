@@ -19,6 +19,9 @@ struct TemporaryFolder {
   std::string operator/(const std::string& name) const { return (path / name).string(); }
 };
 
+/// The networks that come with the program.
+inline const std::string kWeights = VDBC_SOURCE_DIR "/weights/indoor";
+
 inline std::string bytesOf(const std::string& path) {
   std::ifstream in(path, std::ios::binary);
   return {std::istreambuf_iterator<char>(in), {}};

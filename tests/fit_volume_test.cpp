@@ -34,7 +34,7 @@ struct Capture {
   }
 };
 
-Camera lookAt(const Room& room, const Vector3d& eye_room, const Vector3d& target_room) {
+Camera roomCamera(const Room& room, const Vector3d& eye_room, const Vector3d& target_room) {
   const Vector3d z = (target_room - eye_room).normalized();
   const Vector3d x = z.cross(Vector3d::UnitZ()).normalized();
   Eigen::Isometry3d room_from_camera = Eigen::Isometry3d::Identity();
@@ -69,7 +69,7 @@ Capture captureRoom(const Room& room) {
   const Vector3d centre = room.box.center();
   for (const Vector3d& offset : {Vector3d(1, 0.3, -0.2), Vector3d(-0.6, 1, -0.1),
                                  Vector3d(-1, -0.5, 0.1), Vector3d(0.2, -1, 0)}) {
-    capture.cameras.push_back(lookAt(room, centre - 0.5 * offset, centre + offset));
+    capture.cameras.push_back(roomCamera(room, centre - 0.5 * offset, centre + offset));
     capture.depths.push_back(renderDepth(room, capture.cameras.back()));
   }
   return capture;
@@ -132,8 +132,8 @@ TEST(FitVolume, DoesNotTurnWithoutWallsOrWhenToldNotTo) {
   // A sphere from inside: every direction is as good as another.
   Capture sphere;
   for (double angle : {0.0, 1.6, 3.1, 4.7}) {
-    sphere.cameras.push_back(lookAt(roomWith(Matrix3d::Identity(), {0, 0, 0}), {0, 0, 0},
-                                    {std::cos(angle), std::sin(angle), 0}));
+    sphere.cameras.push_back(roomCamera(roomWith(Matrix3d::Identity(), {0, 0, 0}), {0, 0, 0},
+                                        {std::cos(angle), std::sin(angle), 0}));
     const Camera& c = sphere.cameras.back();
     std::vector<float> depth;
     for (int y = 0; y < c.height; ++y)

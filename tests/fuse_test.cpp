@@ -24,7 +24,7 @@ namespace {
 
 using Eigen::Vector3d;
 
-struct Capture {
+struct ShapeCapture {
   std::vector<Camera> cameras;
   std::vector<std::vector<float>> depths;
   std::function<double(const Vector3d&)> distance;  // metres to the truth; positive where free
@@ -55,8 +55,8 @@ struct Capture {
 };
 
 /// A ball of .6 m about (0, 0, 0), from six sides.
-Capture ball() {
-  Capture c;
+ShapeCapture ball() {
+  ShapeCapture c;
   c.distance = [](const Vector3d& p) { return p.norm() - .6; };
   for (const Vector3d& eye : {Vector3d(2, 0, .3), Vector3d(-2, 0, .3), Vector3d(0, 2, .3),
                               Vector3d(0, -2, .3), Vector3d(.3, 0, 2), Vector3d(.3, 0, -2)})
@@ -65,8 +65,8 @@ Capture ball() {
 }
 
 /// The inside of a box of 3 x 2.6 x 2.4 m, from two places.
-Capture room() {
-  Capture c;
+ShapeCapture room() {
+  ShapeCapture c;
   c.distance = [](const Vector3d& p) {
     return std::min(p.minCoeff(), (Vector3d(3, 2.6, 2.4) - p).minCoeff());
   };
@@ -82,12 +82,12 @@ VoxelFrame frameOf(int low, int high) {
   return f;
 }
 
-SeenSpace carved(const Capture& c, const VoxelFrame& f) {
+SeenSpace carved(const ShapeCapture& c, const VoxelFrame& f) {
   Progress silent;
   return carve(f, c.views(), {}, silent);
 }
 
-FloatGrid::Ptr fused(const Capture& c, const VoxelFrame& f, float voxel_m) {
+FloatGrid::Ptr fused(const ShapeCapture& c, const VoxelFrame& f, float voxel_m) {
   FuseSettings s;
   s.voxel_m = voxel_m;
   return fuseDepth(f, carved(c, f), c.views(), s);
@@ -98,7 +98,7 @@ struct Errors {
   int count = 0;
 };
 /// True distances of the points where the grid's values cross 0 between two active voxels.
-Errors errorsOf(const FloatGrid& grid, const Capture& c) {
+Errors errorsOf(const FloatGrid& grid, const ShapeCapture& c) {
   Errors e;
   const auto values = grid.getConstAccessor();
   for (auto value = grid.cbeginValueOn(); value; ++value)
@@ -136,7 +136,7 @@ int64_t openEdges(const FloatGrid& grid) {
 }
 
 TEST(Fuse, ABallIsExactToATenthOfAVoxel) {
-  const Capture c = ball();
+  const ShapeCapture c = ball();
   const Errors e = errorsOf(*fused(c, frameOf(-16, 15), .025f), c);
   ASSERT_GT(e.count, 3000);
   EXPECT_LT(e.rms, .0025);
@@ -144,7 +144,7 @@ TEST(Fuse, ABallIsExactToATenthOfAVoxel) {
 }
 
 TEST(Fuse, ARoomIsExactToATenthOfAVoxel) {
-  const Capture c = room();
+  const ShapeCapture c = room();
   const Errors e = errorsOf(*fused(c, frameOf(-16, 47), .025f), c);
   ASSERT_GT(e.count, 3000);
   EXPECT_LT(e.rms, .0025);
@@ -152,7 +152,7 @@ TEST(Fuse, ARoomIsExactToATenthOfAVoxel) {
 }
 
 TEST(Fuse, NoiseDoesNotShiftTheSurface) {
-  Capture c = room();
+  ShapeCapture c = room();
   std::mt19937 random(5);
   std::normal_distribution<float> noise;
   for (auto& depth : c.depths)
@@ -163,7 +163,7 @@ TEST(Fuse, NoiseDoesNotShiftTheSurface) {
 }
 
 TEST(Fuse, FreeSpaceWinsOverWhatOneViewSawInTheAir) {
-  Capture c = room();
+  ShapeCapture c = room();
   c.add({2.2, 2.2, 1.2}, {0, .6, .9}), c.add({2.5, 1.7, 1.4}, {0, 1, .9});
   // A speck of 20 x 20 pixels at 1 m, in the first view alone.
   for (int y = 50; y < 70; ++y)
@@ -180,7 +180,7 @@ TEST(Fuse, FreeSpaceWinsOverWhatOneViewSawInTheAir) {
 }
 
 TEST(Fuse, TheSurfaceIsClosedAndStandsWhereItWasMeasured) {
-  const Capture c = room();
+  const ShapeCapture c = room();
   const VoxelFrame f = frameOf(-16, 47);
   std::vector<Coord> solid = filledNodes(carved(c, f));
   // A block that was made up, beside the room and away from it.
@@ -208,8 +208,8 @@ TEST(Fuse, TheSurfaceIsClosedAndStandsWhereItWasMeasured) {
 }
 
 /// The plane z = 0 from above, as far as x = 1.2 m at both sides.
-Capture plane() {
-  Capture c;
+ShapeCapture plane() {
+  ShapeCapture c;
   c.distance = [](const Vector3d& p) { return std::abs(p.z()); };
   c.add({0, 0, 2}, {0, .001, 0});
   return c;
@@ -241,7 +241,7 @@ double heightOf(const FloatGrid& surface, double x, double y) {
 
 // The voxels' boundary lies up to a voxel before the plane. It is reached in a slope, not a step.
 TEST(Fuse, AMeasuredPlaneGoesOnBeyondItsBorder) {
-  const Capture c = plane();
+  const ShapeCapture c = plane();
   const VoxelFrame f = frameOf(-18, 17);
   const FloatGrid::Ptr surface = closedSurface(f, voxelsOfPlane(f), *fused(c, f, .025f));
   double farthest = 0;
@@ -262,14 +262,14 @@ TEST(Fuse, AMeasuredPlaneGoesOnBeyondItsBorder) {
 }
 
 TEST(Fuse, WhatViewsSawFreeIsNeverFilled) {
-  Capture c = room();
+  ShapeCapture c = room();
   // A board stands in the air: its border, its shadow on the wall, and what goes on behind it.
   const auto walls = c.distance;
   c.distance = [walls](const Vector3d& p) {
     const Vector3d off = (p - Vector3d(1.2, 1, 1)).cwiseAbs() - Vector3d(.02, .3, .4);
     return std::min(walls(p), off.cwiseMax(0).norm() + std::min(0., off.maxCoeff()));
   };
-  Capture seen;
+  ShapeCapture seen;
   seen.distance = c.distance;
   seen.add({2.4, 2, 1.3}, {0, .8, .9}), seen.add({.6, 2, 1.5}, {2.5, 0, .5});
   const VoxelFrame f = frameOf(-16, 47);
@@ -324,7 +324,7 @@ TEST(Fuse, TheSurfaceOfACaptureIsThatOfItsDepth) {
   if (folder.empty()) GTEST_SKIP() << "no kitchen";
   ReadViewsSettings reading;
   reading.frames = {0, 6, 12, 18};
-  Capture c;
+  ShapeCapture c;
   for (const View& v : readViews(folder, reading))
     c.cameras.push_back(v.camera), c.depths.push_back(v.depth);
   VoxelFrame f;
@@ -357,7 +357,7 @@ TEST(Fuse, TheSurfaceOfACaptureIsThatOfItsDepth) {
 }
 
 TEST(Fuse, DistancesAreThoseOfAnEikonal) {
-  const Capture c = ball();
+  const ShapeCapture c = ball();
   const VoxelFrame f = frameOf(-16, 15);
   const FloatGrid::Ptr surface = closedSurface(f, filledNodes(carved(c, f)), *fused(c, f, .025f));
   const auto values = surface->getConstAccessor();
@@ -379,7 +379,7 @@ TEST(Fuse, DistancesAreThoseOfAnEikonal) {
 }
 
 TEST(Fuse, TheSameValuesForAnyNumberOfThreads) {
-  const Capture c = room();
+  const ShapeCapture c = room();
   const VoxelFrame f = frameOf(-16, 47);
   const auto at = [&](int threads) {
     return withThreads(
@@ -397,7 +397,7 @@ TEST(Fuse, TheSameValuesForAnyNumberOfThreads) {
 
 TEST(Fuse, AFileHoldsWhatWasMeasuredAndIsReadBack) {
   const TemporaryFolder folder;
-  const Capture c = room();
+  const ShapeCapture c = room();
   SceneVoxels scene;
   scene.frame = frameOf(-16, 47);
   scene.ijk = filledNodes(carved(c, scene.frame));
@@ -425,7 +425,7 @@ TEST(Fuse, AFileHoldsWhatWasMeasuredAndIsReadBack) {
 }
 
 TEST(Fuse, VoxelsFollowThePixelsAndStrangeOnesAreRefused) {
-  const Capture c = room();
+  const ShapeCapture c = room();
   const VoxelFrame f = frameOf(-16, 47);
   const double automatic = fused(c, f, 0)->voxelSize()[0];
   EXPECT_GE(automatic, .0099);
@@ -434,7 +434,7 @@ TEST(Fuse, VoxelsFollowThePixelsAndStrangeOnesAreRefused) {
   EXPECT_NEAR(fused(c, f, .03f)->voxelSize()[0], .025, 1e-6);
   expectError([&] { fused(c, f, .2f); }, {"fuseDepth", "0.2"});
   expectError([&] { fused(c, f, .001f); }, {"64th"});
-  Capture blind = c;
+  ShapeCapture blind = c;
   for (auto& depth : blind.depths) std::fill(depth.begin(), depth.end(), std::nanf(""));
   expectError([&] { fuseDepth(f, carved(c, f), blind.views(), {}); }, {"usable depth"});
 }

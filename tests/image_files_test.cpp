@@ -13,6 +13,7 @@
 
 #include "tests/expect_error.h"
 #include "tests/files.h"
+#include "tests/view_files.h"
 
 namespace vdbc {
 namespace {
@@ -25,16 +26,6 @@ class ImageFile : public testing::Test {
 
   TemporaryFolder folder_;
 };
-
-/// A smooth picture, which JPEG keeps.
-Image smoothImage(int w, int h, int c) {
-  Image image(w, h, c);
-  for (int y = 0; y < h; ++y)
-    for (int x = 0; x < w; ++x)
-      for (int k = 0; k < c; ++k)
-        image.at(x, y, k) = 0.5f + 0.4f * std::sin(0.05f * float(x) + 0.03f * float(y) + float(k));
-  return image;
-}
 
 /// Baseline or progressive JPEG of an image with 1 or 3 channels.
 std::string jpegBytes(const Image& image, bool progressive) {

@@ -6,6 +6,7 @@
 #include <limits>
 #include <random>
 
+#include "tests/view_files.h"
 #include "vdb/error.h"
 
 namespace vdbc {
@@ -16,15 +17,6 @@ Image randomImage(int w, int h, int c, unsigned seed) {
   std::uniform_real_distribution<float> value(0.f, 1.f);
   Image image(w, h, c);
   for (float& v : image.data) v = value(random);
-  return image;
-}
-
-Image smoothImage(int w, int h, int c) {
-  Image image(w, h, c);
-  for (int y = 0; y < h; ++y)
-    for (int x = 0; x < w; ++x)
-      for (int k = 0; k < c; ++k)
-        image.at(x, y, k) = 0.5f + 0.4f * std::sin(0.05f * float(x) + 0.03f * float(y) + float(k));
   return image;
 }
 

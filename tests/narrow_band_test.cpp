@@ -24,7 +24,7 @@ void fill(const CoordBBox& box, const std::function<float(const Coord&)>& value,
 }
 
 /// A ball of 7.3 voxels about (1, 2, 3), twice as steep as a distance.
-FloatTree ball() {
+FloatTree steepBall() {
   FloatTree tree = emptyTree();
   fill(
       CoordBBox(Coord(-12), Coord(15)),
@@ -36,7 +36,7 @@ FloatTree ball() {
 }
 
 TEST(NarrowBand, DistancesOfABallAreThoseOfItsRadius) {
-  FloatTree tree = ball();
+  FloatTree tree = steepBall();
   solveDistances(kVoxel, kHalfWidth, &tree);
   int active = 0;
   for (const Coord& c : CoordBBox(Coord(-12), Coord(15))) {
@@ -56,7 +56,7 @@ TEST(NarrowBand, DistancesOfABallAreThoseOfItsRadius) {
 TEST(NarrowBand, DistancesAreTheSameForAnyNumberOfThreads) {
   const auto at = [](int threads) {
     return withThreads(threads, [] {
-      FloatTree tree = ball();
+      FloatTree tree = steepBall();
       solveDistances(kVoxel, kHalfWidth, &tree);
       return tree;
     });

@@ -196,7 +196,7 @@ Gaussians randomScene(int n, int degree, const Camera& camera, unsigned seed, do
   return g;
 }
 
-Image randomImage(int width, int height, int channels, unsigned seed) {
+Image normalImage(int width, int height, int channels, unsigned seed) {
   std::mt19937 random(seed);
   std::normal_distribution<float> normal;
   Image image(width, height, channels);
@@ -259,7 +259,7 @@ std::vector<double> flat(const GaussianGradients& d, int array) {
 void expectImagesAgree(const Gaussians& g, const Camera& camera, RasterSettings settings,
                        double least_cover = 0.3) {
   constexpr int kChannels = 3;
-  const std::vector<float> values = randomImage(int(g.size()), 1, kChannels, 9).data;
+  const std::vector<float> values = normalImage(int(g.size()), 1, kChannels, 9).data;
   const ExtraChannels extra = {kChannels, values.data()};
   settings.median_depth = true;
   const RasterOutput out = rasterize(g, camera, settings, nullptr, extra);
@@ -310,11 +310,11 @@ void expectGradientsAgree(const Gaussians& g, const Camera& camera, RasterSettin
   const int w = camera.width, h = camera.height;
   const bool everything = what == Loss::kEverything, built_in = what != Loss::kColour;
   if (!everything) channels = 0;
-  const std::vector<float> values = randomImage(int(g.size()), 1, channels, 9).data;
+  const std::vector<float> values = normalImage(int(g.size()), 1, channels, 9).data;
   const ExtraChannels extra = {channels, values.data()};
-  const Image d_colour = randomImage(w, h, 3, 11), d_alpha = randomImage(w, h, 1, 12),
-              d_depth = randomImage(w, h, 1, 13), d_median = randomImage(w, h, 1, 14),
-              d_channels = randomImage(w, h, channels, 15);
+  const Image d_colour = normalImage(w, h, 3, 11), d_alpha = normalImage(w, h, 1, 12),
+              d_depth = normalImage(w, h, 1, 13), d_median = normalImage(w, h, 1, 14),
+              d_channels = normalImage(w, h, channels, 15);
   settings.median_depth = everything;
   RasterStatePtr state;
   rasterize(g, camera, settings, &state, extra);
@@ -548,10 +548,10 @@ struct Everything {
 Everything runEverything(const Gaussians& g, const Camera& camera, int channels = 3,
                          int vector_bits = 0) {
   const int w = camera.width, h = camera.height;
-  const std::vector<float> values = randomImage(int(g.size()), 1, channels, 9).data;
-  const Image d_colour = randomImage(w, h, 3, 1), d_depth = randomImage(w, h, 1, 2),
-              d_alpha = randomImage(w, h, 1, 3), d_median = randomImage(w, h, 1, 4),
-              d_channels = randomImage(w, h, channels, 5);
+  const std::vector<float> values = normalImage(int(g.size()), 1, channels, 9).data;
+  const Image d_colour = normalImage(w, h, 3, 1), d_depth = normalImage(w, h, 1, 2),
+              d_alpha = normalImage(w, h, 1, 3), d_median = normalImage(w, h, 1, 4),
+              d_channels = normalImage(w, h, channels, 5);
   RasterSettings settings;
   settings.median_depth = settings.antialias = true;
   settings.vector_bits = vector_bits;
@@ -799,7 +799,7 @@ TEST(Rasterize, GaussiansWithBrokenChannelsContributeNothing) {
   const Gaussians clean = randomScene(50, 0, camera, 75);
   Gaussians g = clean;
   appendRows(&g, randomScene(2, 0, camera, 76));
-  std::vector<float> values = randomImage(52, 2, 1, 77).data;
+  std::vector<float> values = normalImage(52, 2, 1, 77).data;
   values[101] = std::numeric_limits<float>::quiet_NaN();
   values[102] = std::numeric_limits<float>::infinity();
   RasterStatePtr state;

@@ -21,14 +21,14 @@ Camera frontCamera(int width, int height) {
   return camera;
 }
 
-struct Scene {
+struct SceneTensors {
   at::Tensor mean, log_scale, rotation, opacity_logit, sh;
   std::vector<at::Tensor> all() const { return {mean, log_scale, rotation, opacity_logit, sh}; }
 };
 
-Scene randomScene(int64_t n, int64_t coefficients, uint64_t seed) {
+SceneTensors randomScene(int64_t n, int64_t coefficients, uint64_t seed) {
   at::manual_seed(seed);
-  Scene s;
+  SceneTensors s;
   s.mean = at::rand({n, 3}) * 1.6 - 0.8;
   s.mean.select(1, 2) += 2.2;
   s.log_scale = at::randn({n, 3}) * 0.4 - 1.9;
@@ -38,7 +38,7 @@ Scene randomScene(int64_t n, int64_t coefficients, uint64_t seed) {
   return s;
 }
 
-at::Tensor render(const Scene& s, const Camera& camera) {
+at::Tensor render(const SceneTensors& s, const Camera& camera) {
   return rasterizeTorch(s.mean, s.log_scale, s.rotation, s.opacity_logit, s.sh, camera,
                         RasterSettings());
 }
@@ -53,7 +53,7 @@ void expectSame(const at::Tensor& tensor, const std::vector<T>& values, const ch
 
 TEST(RasterizeTorch, AgreesWithTheCoreForwardAndBackward) {
   const Camera camera = frontCamera(45, 37);
-  Scene s = randomScene(200, 4, 1);
+  SceneTensors s = randomScene(200, 4, 1);
   Gaussians g;
   g.resize(200, 1);
   const auto copy = [](const at::Tensor& from, void* to) {
@@ -91,12 +91,12 @@ TEST(RasterizeTorch, AgreesWithTheCoreForwardAndBackward) {
 
 TEST(RasterizeTorch, GradientsMatchFiniteDifferencesAlongRandomDirections) {
   const Camera camera = frontCamera(40, 40);
-  Scene s = randomScene(30, 9, 2);
+  SceneTensors s = randomScene(30, 9, 2);
   // The image jumps where alpha crosses min_alpha, so that is tiny; depth jumps there from 0, so it
   // counts by alpha. Then float differences are good to a percent.
   RasterSettings settings;
   settings.min_alpha = 1e-6f;
-  const auto loss = [&](const Scene& m) {
+  const auto loss = [&](const SceneTensors& m) {
     const at::Tensor image =
         rasterizeTorch(m.mean, m.log_scale, m.rotation, m.opacity_logit, m.sh, camera, settings);
     const at::Tensor weight = at::cos(at::arange(40 * 40 * 5, at::kFloat)).view({40, 40, 5});
@@ -110,7 +110,7 @@ TEST(RasterizeTorch, GradientsMatchFiniteDifferencesAlongRandomDirections) {
     const at::Tensor gradient = s.all()[array].grad();
     const auto moved = [&](double step) {
       at::NoGradGuard guard;
-      Scene m = s;
+      SceneTensors m = s;
       at::Tensor* const tensors[] = {&m.mean, &m.log_scale, &m.rotation, &m.opacity_logit, &m.sh};
       *tensors[array] = s.all()[array].detach() + gradient.sign() * step;
       return loss(m).item<double>();
@@ -124,7 +124,7 @@ TEST(RasterizeTorch, GradientsMatchFiniteDifferencesAlongRandomDirections) {
 
 TEST(RasterizeTorch, FollowsTheGraphOnlyWhereAsked) {
   const Camera camera = frontCamera(20, 20);
-  Scene s = randomScene(20, 1, 3);
+  SceneTensors s = randomScene(20, 1, 3);
   s.sh.set_requires_grad(true);
   const at::Tensor leaf = s.opacity_logit.clone().set_requires_grad(true);
   s.opacity_logit = leaf * 2;
@@ -139,12 +139,12 @@ TEST(RasterizeTorch, FollowsTheGraphOnlyWhereAsked) {
 
 TEST(RasterizeTorch, TakesStridedTensorsAndNone) {
   const Camera camera = frontCamera(20, 20);
-  const Scene s = randomScene(20, 1, 4);
-  Scene strided = s;
+  const SceneTensors s = randomScene(20, 1, 4);
+  SceneTensors strided = s;
   strided.mean = s.mean.t().contiguous().t();
   ASSERT_FALSE(strided.mean.is_contiguous());
   EXPECT_TRUE(at::equal(render(s, camera), render(strided, camera)));
-  Scene none = randomScene(0, 1, 5);
+  SceneTensors none = randomScene(0, 1, 5);
   none.mean.set_requires_grad(true);
   const at::Tensor image = render(none, camera);
   EXPECT_EQ(image.abs().sum().item<float>(), 0.f);
@@ -153,7 +153,7 @@ TEST(RasterizeTorch, TakesStridedTensorsAndNone) {
 
 TEST(RasterizeTorch, GradientsAreFinite) {
   const Camera camera = frontCamera(30, 30);
-  Scene s = randomScene(50, 4, 6);
+  SceneTensors s = randomScene(50, 4, 6);
   s.rotation[0].zero_();
   s.mean[1][2] = 0;
   s.mean[2][0] = std::nan("");
@@ -169,8 +169,8 @@ TEST(RasterizeTorch, GradientsAreFinite) {
 
 TEST(RasterizeTorch, WrongShapesThrow) {
   const Camera camera = frontCamera(20, 20);
-  const Scene good = randomScene(20, 1, 7);
-  Scene s = good;
+  const SceneTensors good = randomScene(20, 1, 7);
+  SceneTensors s = good;
   s.mean = at::rand({20, 4});
   EXPECT_THROW(render(s, camera), Error);
   s = good, s.sh = at::rand({20, 2, 3});

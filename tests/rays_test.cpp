@@ -52,7 +52,7 @@ void addBox(const Vector3f& lo, const Vector3f& hi, TriangleMesh* mesh) {
     }
 }
 
-VoxelFrame turnedFrame() {
+VoxelFrame tiltedFrame() {
   VoxelFrame frame;
   frame.voxel_m = .1f;
   frame.world_from_grid =
@@ -119,7 +119,7 @@ TEST(RayTarget, SharedEdgesOfAMeshAreClosed) {
 }
 
 TEST(RayTarget, VoxelsAreTheirBoxes) {
-  const VoxelFrame frame = turnedFrame();
+  const VoxelFrame frame = tiltedFrame();
   const std::vector<Coord> voxels = {{0, 0, 0}, {-7, 3, 2}, {5, 5, -5}, {5, 5, -4}, {-2, -9, 8}};
   const RayTarget target = RayTarget::fromVoxels(frame, voxels);
   Random random(3);
@@ -234,7 +234,7 @@ TEST(DepthAgreement, CountsErrorsMissesAndInvalidPixels) {
 
 TEST(LeakRate, IsZeroForItselfOneForNothingAndTheShareForHalf) {
   // A hollow cube of voxels, seen from its middle.
-  VoxelFrame frame = turnedFrame();
+  VoxelFrame frame = tiltedFrame();
   std::vector<Coord> shell, half;
   for (const Coord& c : block({-5, -5, -5}, {4, 4, 4}))
     if (std::max({c.x(), c.y(), c.z()}) == 4 || std::min({c.x(), c.y(), c.z()}) == -5) {

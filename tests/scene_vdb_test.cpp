@@ -77,7 +77,7 @@ SceneVoxels shellScene(const VoxelFrame& frame, double radius) {
 }
 
 using Row = std::tuple<float, float, float, float, int, float, int>;
-std::map<Coord, Row> rowsOf(const SceneVoxels& v) {
+std::map<Coord, Row> rowsByVoxel(const SceneVoxels& v) {
   std::map<Coord, Row> rows;
   for (size_t i = 0; i < v.ijk.size(); ++i)
     rows[v.ijk[i]] = {v.colour_linear[i].x(), v.colour_linear[i].y(), v.colour_linear[i].z(),
@@ -100,7 +100,7 @@ TEST(SceneVdb, RoundTripIsExact) {
     writeSceneVdb(before, folder / "a.vdb");
     const SceneVoxels after = readSceneVdb(folder / "a.vdb");
     EXPECT_EQ(after.ijk.size(), before.ijk.size());
-    EXPECT_EQ(rowsOf(after), rowsOf(before));
+    EXPECT_EQ(rowsByVoxel(after), rowsByVoxel(before));
     EXPECT_EQ(emptyOf(after), emptyOf(before));
     EXPECT_EQ(after.frame.bounds, frame.bounds);
     EXPECT_EQ(after.frame.voxel_m, frame.voxel_m);
@@ -245,7 +245,7 @@ TEST(SceneVdb, FilesWrittenAgainByOthersAreRead) {
   openvdb::io::File file(folder / "a.vdb");
   file.open(false);
   openvdb::io::File(folder / "b.vdb").write(*file.getGrids(), *file.getMetadata());
-  EXPECT_EQ(rowsOf(readSceneVdb(folder / "b.vdb")), rowsOf(before));
+  EXPECT_EQ(rowsByVoxel(readSceneVdb(folder / "b.vdb")), rowsByVoxel(before));
 }
 
 TEST(SceneVdb, ForeignFilesWithNonsenseThrow) {

@@ -29,7 +29,7 @@ CoordBBox randomBoxIn(const CoordBBox& box, std::mt19937& random) {
 }
 
 /// Voxels in an odd box: empty ones in large pieces with holes, filled ones scattered.
-SeenSpace randomVoxels(unsigned seed) {
+SeenSpace randomSpace(unsigned seed) {
   std::mt19937 random(seed);
   const auto odd = [&](int most) { return int(random() % unsigned(most)); };
   const Coord low(odd(40) - 35, odd(40) - 35, odd(40) - 35);
@@ -52,7 +52,7 @@ SeenSpace randomVoxels(unsigned seed) {
 
 /// The same for nodes of a level.
 SeenSpace randomNodes(unsigned seed) {
-  SeenSpace space = randomVoxels(seed);
+  SeenSpace space = randomSpace(seed);
   space.level = 1 + int(seed % 2);
   return space;
 }
@@ -66,7 +66,7 @@ bool touchesUnobserved(const SeenSpace& space, const Coord& c) {
 TEST(PoolSeen, FollowsItsRuleOnRandomVoxels) {
   std::map<std::pair<int, NodeState>, int> kinds;
   for (unsigned seed = 1; seed <= 60; ++seed) {
-    const SeenSpace voxels = randomVoxels(seed);
+    const SeenSpace voxels = randomSpace(seed);
     for (int level = 0; level <= 5; ++level) {
       SCOPED_TRACE(testing::Message() << "seed " << seed << " level " << level);
       const SeenSpace pooled = poolSeen(voxels, level);
@@ -151,7 +151,7 @@ TEST(SeenSpace, FilledWinsAndLookupsAgree) {
   EXPECT_EQ(space.at(Coord(3)), NodeState::kEmpty);
   EXPECT_EQ(space.at(Coord(4)), NodeState::kUnobserved);
   for (unsigned seed = 1; seed <= 5; ++seed) {
-    const SeenSpace random = randomVoxels(seed);
+    const SeenSpace random = randomSpace(seed);
     const StateLookup lookup(random);
     CoordBBox around = random.box;
     around.expand(2);

@@ -16,16 +16,14 @@
 namespace vdbc {
 namespace {
 
-constexpr const char* kWeights = VDBC_SOURCE_DIR "/weights/indoor";
-
 struct Made {
   SceneVoxels voxels;
   Gaussians points;
 };
 
 Made completed(const Eigen::Vector3d& shift, const std::string& stem) {
-  const Encoder encoder(std::string(kWeights) + "/encoder.safetensors");
-  const Completer completer(std::string(kWeights) + "/completer.safetensors");
+  const Encoder encoder(kWeights + "/encoder.safetensors");
+  const Completer completer(kWeights + "/completer.safetensors");
   std::vector<View> views = simpleRoomViews(2, 96, 72, 7);
   for (View& v : views) v.camera.world_from_camera.pretranslate(shift);
   Progress silent;

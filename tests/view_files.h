@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <Eigen/Geometry>
+#include <cmath>
 #include <random>
 #include <string>
 #include <vector>
@@ -14,6 +15,16 @@
 #include "tests/files.h"
 
 namespace vdbc {
+
+/// A smooth picture, which JPEG keeps.
+inline Image smoothImage(int w, int h, int c) {
+  Image image(w, h, c);
+  for (int y = 0; y < h; ++y)
+    for (int x = 0; x < w; ++x)
+      for (int k = 0; k < c; ++k)
+        image.at(x, y, k) = 0.5f + 0.4f * std::sin(0.05f * float(x) + 0.03f * float(y) + float(k));
+  return image;
+}
 
 inline Eigen::Isometry3d somePose(unsigned seed) {
   std::mt19937 random(seed);

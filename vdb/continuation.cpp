@@ -14,7 +14,7 @@ namespace {
 
 using Eigen::Vector3f;
 using Leaf = FloatTree::LeafNodeType;
-using Values = openvdb::tree::ValueAccessor<const FloatTree, false>;
+using FloatValues = openvdb::tree::ValueAccessor<const FloatTree, false>;
 
 const std::array<Coord, 6> kBeside = {Coord(-1, 0, 0), Coord(1, 0, 0),  Coord(0, -1, 0),
                                       Coord(0, 1, 0),  Coord(0, 0, -1), Coord(0, 0, 1)};
@@ -30,14 +30,14 @@ struct Plane {
   bool ends() const { return normal.isZero(); }
 };
 
-bool isBorder(Values* measured, const Coord& ijk) {
+bool isBorder(FloatValues* measured, const Coord& ijk) {
   for (const Coord& step : kBeside)
     if (!measured->isValueOn(ijk + step)) return true;
   return false;
 }
 
 // The direction in which the measured distance grows around a voxel; 0 where that is not clear.
-Vector3f fittedNormal(Values* measured, const Coord& ijk, int half_width, float voxel) {
+Vector3f fittedNormal(FloatValues* measured, const Coord& ijk, int half_width, float voxel) {
   Eigen::Matrix4f squares = Eigen::Matrix4f::Zero();
   Eigen::Vector4f products = Eigen::Vector4f::Zero();
   const float cut_off = .99f * measured->tree().background();
@@ -84,7 +84,7 @@ Planes bordersOf(const FloatTree& measured, float voxel, int plane_voxels) {
   std::vector<std::vector<std::pair<Coord, Plane>>> found(leaves.size());
   const float near = measured.background() - voxel;
   tbb::parallel_for(size_t(0), leaves.size(), [&](size_t i) {
-    Values values(measured);
+    FloatValues values(measured);
     for (auto value = leaves[i]->cbeginValueOn(); value; ++value) {
       const Coord ijk = value.getCoord();
       if (std::abs(*value) > near || !isBorder(&values, ijk)) continue;
@@ -120,7 +120,7 @@ Plane meanPlane(const Planes& planes, const Coord& ijk) {
 
 // Adds the voxels beside those from row `begin` on that are neither measured nor there yet.
 void addLayer(const FloatTree& measured, size_t begin, Planes* planes) {
-  Values known(measured);
+  FloatValues known(measured);
   const size_t end = planes->size();
   for (size_t i = begin; i < end; ++i) {
     if ((*planes)[i].ends()) continue;

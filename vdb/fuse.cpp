@@ -9,6 +9,7 @@
 
 #include "vdb/continuation.h"
 #include "vdb/error.h"
+#include "vdb/median.h"
 #include "vdb/narrow_band.h"
 #include "vdb/vdb_file.h"
 
@@ -22,7 +23,7 @@ constexpr double kPixelsAVoxel = 8, kSigmasAVoxel = 4;
 constexpr double kFinest = .01, kCoarsest = .05;  // metres
 constexpr int kCell = 4;                          // pixels over whose means slopes are taken
 constexpr double kSameSurface = .03;              // of 1/z: neighbours within are one surface
-constexpr double kLeastCosine = .1;
+constexpr double kLeastRayCosine = .1;
 // Voxels: a measured surface goes on so far beyond its border, and from there on bends to the solid
 // ones' boundary; so far before it must be open; so far beyond solid voxels it may go.
 constexpr float kHold = .5f, kEnd = 2.5f, kFill = .25f;
@@ -95,14 +96,8 @@ void findCosines(FuseView* v) {
       const double nz = q - nx * rx - ny * ry;
       const double length = std::sqrt((nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + 1));
       v->cosine[size_t(y) * size_t(v->cells_x) + size_t(x)] =
-          float(std::clamp(q / length, kLeastCosine, 1.));
+          float(std::clamp(q / length, kLeastRayCosine, 1.));
     }
-}
-
-double median(std::vector<double>* values) {
-  const auto middle = values->begin() + std::ptrdiff_t(values->size() / 2);
-  std::nth_element(values->begin(), middle, values->end());
-  return *middle;
 }
 
 // Second differences of 1/z vanish on planes: sigma from their median, along rows.
@@ -230,7 +225,7 @@ void addDistance(const FuseView& v, const Vector3d& p, double band, Evidence* e)
     e->free += float(1 / (p.z() * p.z()));
     return;
   }
-  const auto weight = float(std::pow(known > 0 ? known : kLeastCosine, 4) / (z * z));
+  const auto weight = float(std::pow(known > 0 ? known : kLeastRayCosine, 4) / (z * z));
   e->sum += weight * float(distance), e->near += weight;
 }
 

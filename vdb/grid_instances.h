@@ -1,6 +1,6 @@
 #pragma once
 // The grid and tree types that this project creates, instantiated once each, in
-// grid_instances_*.cpp.
+// grid_instances.cpp.
 //
 // Creating a grid or a tree emits its whole vtable (copying, reading, writing, merging, ...): 9 to
 // 16 s of compiling per type and file. Include this wherever one is created or copied (TokenMask

@@ -14,10 +14,10 @@
 namespace vdbc {
 namespace {
 
-constexpr const char* kWrite = "writeLatentVdb";
-constexpr const char* kRead = "readLatentVdb";
-constexpr uint64_t kMaxBytes = uint64_t(1) << 34;
-constexpr int kMaxDim = 1024;                     // as the encoder's configuration
+constexpr const char* kWriteLatent = "writeLatentVdb";
+constexpr const char* kReadLatent = "readLatentVdb";
+constexpr uint64_t kMaxLatentBytes = uint64_t(1) << 34;
+constexpr int kMaxLatentDim = 1024;               // as the encoder's configuration
 constexpr int64_t kMaxValues = int64_t(1) << 30;  // of all latents: 4 GiB
 
 // Names of the grids, of attributes beside Place::columns(), and of metadata: the format, shared by
@@ -27,10 +27,10 @@ constexpr const char* kFilled = "filled";
 constexpr const char* kEmpty = "empty";
 constexpr const char* kRow = "row";
 constexpr const char* kLevel = "latent_level";
-constexpr const char* kDim = "latent_dim";
+constexpr const char* kLatentDim = "latent_dim";
 constexpr const char* kHash = "encoder_hash";
 constexpr const char* kGrowth = "growth";
-constexpr const char* kFrame = "world_from_grid";
+constexpr const char* kGridFrame = "world_from_grid";
 constexpr const char* kCamera = "camera_";  // and a number: width height fx fy cx cy, pose by rows
 constexpr int kMaxCameras = 65536;
 
@@ -61,23 +61,23 @@ void requireTokens(const char* operation, const Place& g, const std::string& pat
   }
 }
 
-void requireWritable(const Place& g, const std::string& path) {
-  require(g.level >= 0 && g.level < kTokenLevels && g.dim > 0 && g.dim <= kMaxDim &&
+void requireWritablePlace(const Place& g, const std::string& path) {
+  require(g.level >= 0 && g.level < kTokenLevels && g.dim > 0 && g.dim <= kMaxLatentDim &&
               std::isfinite(g.frame.voxel_m) && g.frame.voxel_m > 0,
-          kWrite, ": ", path, ": expected level 0-2, dim 1-", kMaxDim,
+          kWriteLatent, ": ", path, ": expected level 0-2, dim 1-", kMaxLatentDim,
           " and a voxel size, found level ", g.level, ", dim ", g.dim, ", ", g.frame.voxel_m, " m");
-  requireRows(g, joinText(kWrite, ": ", path));
-  require(g.size() * g.dim <= kMaxValues, kWrite, ": ", path, ": expected at most ", kMaxValues,
-          " values, found ", g.size(), " x ", g.dim);
-  requireTokens(kWrite, g, path);
+  requireRows(g, joinText(kWriteLatent, ": ", path));
+  require(g.size() * g.dim <= kMaxValues, kWriteLatent, ": ", path, ": expected at most ",
+          kMaxValues, " values, found ", g.size(), " x ", g.dim);
+  requireTokens(kWriteLatent, g, path);
   for (const TokenMask* mask : {&g.seen->filled, &g.seen->empty}) {
     CoordBBox box;
-    require(!mask->evalActiveVoxelBoundingBox(box) || g.frame.bounds.isInside(box), kWrite, ": ",
-            path, ": voxels ", box, " lie outside the volume ", g.frame.bounds);
+    require(!mask->evalActiveVoxelBoundingBox(box) || g.frame.bounds.isInside(box), kWriteLatent,
+            ": ", path, ": voxels ", box, " lie outside the volume ", g.frame.bounds);
   }
 }
 
-void fillLeaf(const Place& g, const std::vector<int64_t>& sorted, const LeafRows& range) {
+void fillLatentLeaf(const Place& g, const std::vector<int64_t>& sorted, const LeafRows& range) {
   PointLeaf& leaf = *range.leaf;
   auto position = writeHandle<openvdb::Vec3f, ExactCodec>(leaf, "P");
   auto number = writeHandle<int32_t, ExactCodec>(leaf, kRow);
@@ -101,7 +101,7 @@ PointGrid::Ptr latentGrid(const Place& g, const std::string& path) {
       g.ijk, openvdb::points::TypedAttributeArray<openvdb::Vec3f, ExactCodec>::attributeType());
   for (size_t i = 1; i < layout.rows.size(); ++i) {
     const Coord& ijk = g.ijk[size_t(layout.rows[i])];
-    require(ijk != g.ijk[size_t(layout.rows[i - 1])], kWrite, ": ", path, ": node ", ijk,
+    require(ijk != g.ijk[size_t(layout.rows[i - 1])], kWriteLatent, ": ", path, ": node ", ijk,
             " is there twice");
   }
   if (!layout.leaves.empty()) {
@@ -112,7 +112,7 @@ PointGrid::Ptr latentGrid(const Place& g, const std::string& path) {
     });
     appendAttribute<int32_t, ExactCodec>(tree, kRow);
     tbb::parallel_for(size_t(0), layout.leaves.size(),
-                      [&](size_t l) { fillLeaf(g, layout.rows, layout.leaves[l]); });
+                      [&](size_t l) { fillLatentLeaf(g, layout.rows, layout.leaves[l]); });
     openvdb::points::compactAttributes(tree);
   }
   auto grid = PointGrid::create(layout.tree);
@@ -145,7 +145,7 @@ Camera cameraOf(const std::string& text, const std::string& path) {
                     std::abs(c.cx) < 1e9 && std::abs(c.cy) < 1e9 &&
                     (turn.transpose() * turn - Eigen::Matrix3d::Identity()).norm() < .01 &&
                     c.world_from_camera.translation().norm() < kMaxWorldM;
-  require(sane, kRead, ": ", path, ": expected a camera of 18 numbers, found '", text, "'");
+  require(sane, kReadLatent, ": ", path, ": expected a camera of 18 numbers, found '", text, "'");
   return c;
 }
 
@@ -155,12 +155,12 @@ openvdb::MetaMap metadataOf(const Place& g) {
   metadata.insertMeta(kHash, openvdb::StringMetadata(g.encoder_hash));
   if (!g.growth.empty()) metadata.insertMeta(kGrowth, openvdb::StringMetadata(g.growth));
   metadata.insertMeta(kLevel, openvdb::Int32Metadata(g.level));
-  metadata.insertMeta(kDim, openvdb::Int32Metadata(g.dim));
+  metadata.insertMeta(kLatentDim, openvdb::Int32Metadata(g.dim));
   insertVolume(g.frame, &metadata);
   openvdb::Mat4d frame;  // row vectors, as OpenVDB has them
   for (int row = 0; row < 4; ++row)
     for (int col = 0; col < 4; ++col) frame[row][col] = g.frame.world_from_grid.matrix()(col, row);
-  metadata.insertMeta(kFrame, openvdb::Mat4DMetadata(frame));
+  metadata.insertMeta(kGridFrame, openvdb::Mat4DMetadata(frame));
   for (size_t i = 0; g.detail && i < g.cameras.size(); ++i)
     metadata.insertMeta(joinText(kCamera, i), openvdb::StringMetadata(textOf(g.cameras[i])));
   const auto observed = std::count(g.generated.begin(), g.generated.end(), uint8_t(0));
@@ -172,14 +172,14 @@ openvdb::MetaMap metadataOf(const Place& g) {
 /// The frame bit for bit: a transform holds it as products, good to 15 digits only.
 VoxelFrame exactFrame(const openvdb::MetaMap& metadata, const VoxelFrame& approximate,
                       const std::string& path) {
-  const auto m = findMetadata<openvdb::Mat4d>(kRead, metadata, kFrame, path);
+  const auto m = findMetadata<openvdb::Mat4d>(kReadLatent, metadata, kGridFrame, path);
   VoxelFrame frame = approximate;
   for (int row = 0; row < 4; ++row)
     for (int col = 0; col < 4; ++col) frame.world_from_grid.matrix()(col, row) = m[row][col];
   const Eigen::Matrix4d& expected = approximate.world_from_grid.matrix();
   const double error = (frame.world_from_grid.matrix() - expected).cwiseAbs().maxCoeff();
-  require(error <= 1e-6 * std::max(1., expected.cwiseAbs().maxCoeff()), kRead, ": ", path,
-          ": expected the transform of the metadata '", kFrame, "', found one ", error, " off");
+  require(error <= 1e-6 * std::max(1., expected.cwiseAbs().maxCoeff()), kReadLatent, ": ", path,
+          ": expected the transform of the metadata '", kGridFrame, "', found one ", error, " off");
   return frame;
 }
 
@@ -189,17 +189,18 @@ std::vector<const PointLeaf*> checkedLeaves(const PointGrid& grid, const Place& 
   std::vector<const PointLeaf*> leaves;
   *count = 0;
   const auto requireAttribute = [&](const PointLeaf& leaf, const char* name, size_t width) {
-    require(hasAttribute(leaf, name), kRead, ": ", path, ": grid 'latent' has no attribute ", name);
+    require(hasAttribute(leaf, name), kReadLatent, ": ", path, ": grid 'latent' has no attribute ",
+            name);
     const auto stride = leaf.constAttributeArray(name).stride();
-    require(size_t(stride) == width, kRead, ": ", path, ": expected ", name, " with ", width,
+    require(size_t(stride) == width, kReadLatent, ": ", path, ": expected ", name, " with ", width,
             " values, found ", stride);
   };
   for (auto leaf = grid.tree().cbeginLeaf(); leaf; ++leaf) {
-    const size_t points = checkedPointCount(kRead, *leaf, path);
+    const size_t points = checkedPointCount(kReadLatent, *leaf, path);
     openvdb::Index before = 0;
     for (openvdb::Index v = 0; v < PointLeaf::SIZE; ++v) {
       const auto end = openvdb::Index(leaf->getValue(v));
-      require(end - before <= 1, kRead, ": ", path, ": expected one point a node, found ",
+      require(end - before <= 1, kReadLatent, ": ", path, ": expected one point a node, found ",
               end - before, " at ", leaf->offsetToGlobalCoord(v));
       before = end;
     }
@@ -208,7 +209,7 @@ std::vector<const PointLeaf*> checkedLeaves(const PointGrid& grid, const Place& 
                      [&](const auto& c, auto, auto) { requireAttribute(*leaf, c.name, c.width); });
     requireAttribute(*leaf, kRow, 1);
     *count += points;
-    require(int64_t(*count) * g.dim <= kMaxValues, kRead, ": ", path, ": expected at most ",
+    require(int64_t(*count) * g.dim <= kMaxValues, kReadLatent, ": ", path, ": expected at most ",
             kMaxValues, " values, found more");
     leaves.push_back(&*leaf);
   }
@@ -222,8 +223,8 @@ void readLeaf(const PointLeaf& leaf, std::vector<uint8_t>* taken, Place* g,
   for (openvdb::Index v = 0; v < PointLeaf::SIZE; ++v) {
     if (size_t(leaf.getValue(v)) == rows.size()) continue;
     const int64_t row = number.get(openvdb::Index(rows.size()));
-    require(row >= 0 && row < int64_t(taken->size()) && !(*taken)[size_t(row)], kRead, ": ", path,
-            ": expected each row from 0 to ", taken->size() - 1, " once, found ", row);
+    require(row >= 0 && row < int64_t(taken->size()) && !(*taken)[size_t(row)], kReadLatent, ": ",
+            path, ": expected each row from 0 to ", taken->size() - 1, " once, found ", row);
     (*taken)[size_t(row)] = 1;
     g->ijk[size_t(row)] = leaf.offsetToGlobalCoord(v);
     rows.push_back(size_t(row));
@@ -242,13 +243,13 @@ void readTokens(const PointGrid& grid, Place* g, const std::string& path) {
   forEachColumn([&](auto c) { c.values.resize(n * c.width); }, *g);
   std::vector<uint8_t> taken(n, 0);
   for (const PointLeaf* leaf : leaves) readLeaf(*leaf, &taken, g, path);
-  requireTokens(kRead, *g, path);
+  requireTokens(kReadLatent, *g, path);
 }
 
 }  // namespace
 
 void writeLatentVdb(const Place& place, const std::string& path) {
-  requireWritable(place, path);
+  requireWritablePlace(place, path);
   openvdb::initialize();
   const std::pair<const char*, openvdb::GridBase::Ptr> named[] = {
       {kLatent, latentGrid(place, path)},
@@ -263,39 +264,40 @@ void writeLatentVdb(const Place& place, const std::string& path) {
     if (name != kLatent) grid->setTransform(voxels);
     grids.push_back(grid);
   }
-  writeVdb(kWrite, path, grids, metadataOf(place));
+  writeVdb(kWriteLatent, path, grids, metadataOf(place));
 }
 
 Place readLatentVdb(const std::string& path) {
-  const auto [grids, metadata] = readVdb(kRead, path, kMaxBytes);
-  const auto tokens = findGrid<PointGrid>(kRead, grids, kLatent, path);
-  const auto filled = findGrid<BoolGrid>(kRead, grids, kFilled, path);
-  const auto empty = findGrid<BoolGrid>(kRead, grids, kEmpty, path);
+  const auto [grids, metadata] = readVdb(kReadLatent, path, kMaxLatentBytes);
+  const auto tokens = findGrid<PointGrid>(kReadLatent, grids, kLatent, path);
+  const auto filled = findGrid<BoolGrid>(kReadLatent, grids, kFilled, path);
+  const auto empty = findGrid<BoolGrid>(kReadLatent, grids, kEmpty, path);
   Place g;
-  g.level = findMetadata<int32_t>(kRead, metadata, kLevel, path);
-  g.dim = findMetadata<int32_t>(kRead, metadata, kDim, path);
-  require(g.level >= 0 && g.level < kTokenLevels && g.dim > 0 && g.dim <= kMaxDim, kRead, ": ",
-          path, ": expected level 0-2 and dim 1-", kMaxDim, ", found level ", g.level, ", dim ",
-          g.dim);
+  g.level = findMetadata<int32_t>(kReadLatent, metadata, kLevel, path);
+  g.dim = findMetadata<int32_t>(kReadLatent, metadata, kLatentDim, path);
+  require(g.level >= 0 && g.level < kTokenLevels && g.dim > 0 && g.dim <= kMaxLatentDim,
+          kReadLatent, ": ", path, ": expected level 0-2 and dim 1-", kMaxLatentDim,
+          ", found level ", g.level, ", dim ", g.dim);
   for (const auto& [grid, level] : {std::pair<const openvdb::GridBase*, int>(tokens.get(), g.level),
                                     {filled.get(), 0},
                                     {empty.get(), 0}})
-    g.frame =
-        exactFrame(metadata, readVolume(kRead, metadata, grid->transform(), level, path), path);
-  g.encoder_hash = findMetadata<std::string>(kRead, metadata, kHash, path);
-  if (metadata[kGrowth]) g.growth = findMetadata<std::string>(kRead, metadata, kGrowth, path);
+    g.frame = exactFrame(metadata,
+                         readVolume(kReadLatent, metadata, grid->transform(), level, path), path);
+  g.encoder_hash = findMetadata<std::string>(kReadLatent, metadata, kHash, path);
+  if (metadata[kGrowth]) g.growth = findMetadata<std::string>(kReadLatent, metadata, kGrowth, path);
   for (int i = 0; i < kMaxCameras && metadata[joinText(kCamera, i)]; ++i)
     g.cameras.push_back(cameraOf(
-        findMetadata<std::string>(kRead, metadata, joinText(kCamera, i).c_str(), path), path));
+        findMetadata<std::string>(kReadLatent, metadata, joinText(kCamera, i).c_str(), path),
+        path));
   try {
     readTokens(*tokens, &g, path);
   } catch (const openvdb::Exception& error) {  // an attribute of another type
-    throw Error(joinText(kRead, ": ", path, ": corrupt or unreadable: ", error.what()));
+    throw Error(joinText(kReadLatent, ": ", path, ": corrupt or unreadable: ", error.what()));
   }
   const auto seen = std::make_shared<SeenSpace>();
   seen->box = g.frame.bounds;
-  seen->filled.root() = maskOfGrid(kRead, *filled, g.frame.bounds, path).root();
-  seen->empty.root() = maskOfGrid(kRead, *empty, g.frame.bounds, path).root();
+  seen->filled.root() = maskOfGrid(kReadLatent, *filled, g.frame.bounds, path).root();
+  seen->empty.root() = maskOfGrid(kReadLatent, *empty, g.frame.bounds, path).root();
   g.seen = seen;
   return g;
 }

@@ -9,7 +9,7 @@
 namespace vdbc {
 namespace {
 
-constexpr const char* kRead = "readTokenMask";
+constexpr const char* kReadMask = "readTokenMask";
 constexpr const char* kMask = "mask";
 
 template <typename GridType>
@@ -33,14 +33,14 @@ bool activeVoxels(const openvdb::GridBase& grid, MaskTree* mask) {
 
 TokenMask readTokenMask(const std::string& path, const VoxelFrame& frame, int level) {
   constexpr uint64_t kMaxBytes = uint64_t(1) << 32;
-  const VdbFile file = readVdb(kRead, path, kMaxBytes);
+  const VdbFile file = readVdb(kReadMask, path, kMaxBytes);
   MaskTree mask;
   openvdb::math::Transform::Ptr transform;
   for (const bool named : {true, false})
     for (const auto& grid : file.grids)
       if (!transform && grid && (!named || grid->getName() == kMask) && activeVoxels(*grid, &mask))
         transform = grid->transformPtr();
-  require(bool(transform), kRead, ": ", path,
+  require(bool(transform), kReadMask, ": ", path,
           ": expected a grid of type bool, mask, float or vec3s, found none");
 
   const CoordBBox nodes = nodesIn(frame.bounds, level);
@@ -67,7 +67,7 @@ TokenMask readTokenMask(const std::string& path, const VoxelFrame& frame, int le
   openvdb::tree::ValueAccessor<TokenMask> set(tokens);
   for (const auto& row : rows)
     for (const Coord& node : row) set.setValueOn(node);
-  require(!tokens.empty(), kRead, ": ", path,
+  require(!tokens.empty(), kReadMask, ": ", path,
           ": holds no voxel of the place (expected the cameras' frame, metres)");
   return tokens;
 }

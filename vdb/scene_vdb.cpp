@@ -152,7 +152,7 @@ typename GridType::Ptr voxelGrid(const std::vector<Coord>& ijk, const Value& val
   return grid;
 }
 
-void requireWritable(const SceneVoxels& v, const std::string& path) {
+void requireWritableVoxels(const SceneVoxels& v, const std::string& path) {
   requireRows(v, joinText("writeSceneVdb: ", path));
   require(std::isfinite(v.frame.voxel_m) && v.frame.voxel_m > 0, "writeSceneVdb: ", path,
           ": expected a positive voxel size, found ", v.frame.voxel_m);
@@ -166,8 +166,8 @@ void requireWritable(const SceneVoxels& v, const std::string& path) {
 }
 
 // How many voxels of a grid lie along a voxel of the frame; throws where it is not in the frame.
-int partsOf(const char* operation, const openvdb::GridBase& grid, const VoxelFrame& frame,
-            const std::string& path) {
+int checkedParts(const char* operation, const openvdb::GridBase& grid, const VoxelFrame& frame,
+                 const std::string& path) {
   const int parts = detailPartsOf(frame, grid);
   VoxelFrame detail = frame;
   detail.voxel_m = frame.voxel_m / float(parts);
@@ -186,7 +186,7 @@ int partsOf(const char* operation, const openvdb::GridBase& grid, const VoxelFra
 // A distance grid of another program's making may hold anything.
 FloatGrid::ConstPtr checkedDistance(const char* operation, const FloatGrid::Ptr& grid,
                                     const VoxelFrame& frame, const std::string& path) {
-  const float edge = frame.voxel_m / float(partsOf(operation, *grid, frame, path));
+  const float edge = frame.voxel_m / float(checkedParts(operation, *grid, frame, path));
   const float most = 1.01f * float(kDetailBand) * edge;
   for (auto value = grid->cbeginValueOn(); value; ++value)
     require(std::abs(*value) <= most, operation, ": ", path, ": voxel ", value.getCoord(), " of '",
@@ -226,7 +226,7 @@ std::vector<Coord> solidVoxels(const SceneVoxels& v) {
 }
 
 void writeSceneVdb(const SceneVoxels& v, const std::string& path, const DetailGrids& detail) {
-  requireWritable(v, path);
+  requireWritableVoxels(v, path);
   openvdb::initialize();
   std::vector<std::pair<const char*, openvdb::GridBase::Ptr>> named = {
       {kSurface, detail.surface ? detail.surface : boundaryLevelSet(v)}};
@@ -341,7 +341,7 @@ SceneVoxels readSceneVdb(const std::string& path) {
         if constexpr (!std::is_same_v<Value, Coord>) {
           const auto grid = findGrid<typename GridOf<Value>::Grid>(kOperation, grids, c.name, path);
           const VoxelValues<typename GridOf<Value>::Grid> value(
-              *grid, partsOf(kOperation, *grid, voxels.frame, path));
+              *grid, checkedParts(kOperation, *grid, voxels.frame, path));
           c.values.resize(voxels.ijk.size());
           for (size_t i = 0; i < voxels.ijk.size(); ++i)
             require(fromGrid(value.at(voxels.ijk[i]), &c.values[i]), kOperation, ": ", path,

@@ -31,7 +31,7 @@ using TokenIndexTree = ComputeTree<openvdb::Int32>;
 
 }  // namespace vdbc
 
-// Instantiated in grid_instances_tokens.cpp: else every file that owns one compiles its vtable.
+// Instantiated in grid_instances.cpp: else every file that owns one compiles its vtable.
 extern template class openvdb::tree::Tree<vdbc::TokenMask::RootNodeType>;
 extern template class openvdb::tree::Tree<vdbc::TokenIndexTree::RootNodeType>;
 

@@ -11,8 +11,6 @@
 namespace vdbc {
 namespace {
 
-constexpr uint64_t kMaxFileBytes = uint64_t(1) << 32;
-
 /// Channels of one part that belong together.
 struct ChannelSet {
   int part = -1;
@@ -170,7 +168,7 @@ std::vector<float> exrDepth(const ViewChannels& channels, const Camera& camera,
 
 View readExrView(const std::string& path, const std::string& name,
                  const ReadViewsSettings& settings) {
-  const ExrFile file(kReadViews, path, readFile(kReadViews, path, kMaxFileBytes));
+  const ExrFile file(kReadViews, path, readFile(kReadViews, path, kMaxImageBytes));
   const ViewChannels channels = findViewChannels(file);
   require(channels.colour.found() || settings.cameras_only, kReadViews, ": ", path,
           ": no colour (expected channels R, G, B)");

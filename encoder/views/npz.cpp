@@ -10,9 +10,9 @@
 namespace vdbc {
 namespace {
 
-constexpr uint64_t kMaxHeaderBytes = 1 << 16;
+constexpr uint64_t kMaxNpyHeaderBytes = 1 << 16;
 constexpr uint64_t kMaxArrayBytes = uint64_t(1) << 34;
-constexpr int64_t kMaxDim = int64_t(1) << 28;
+constexpr int64_t kMaxExtent = int64_t(1) << 28;
 static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "values are copied as they are");
 
 template <typename T>
@@ -53,7 +53,7 @@ std::optional<std::vector<int64_t>> parseShape(std::string_view text) {
     text.remove_prefix(begin);
     int64_t dim = -1;
     const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), dim);
-    if (error != std::errc() || dim < 0 || dim > kMaxDim || shape.size() == 8) return {};
+    if (error != std::errc() || dim < 0 || dim > kMaxExtent || shape.size() == 8) return {};
     shape.push_back(dim);
     text.remove_prefix(size_t(end - text.data()));
   }
@@ -90,7 +90,7 @@ std::optional<NpyArray> NpzFile::describe(const std::string& name) const {
   NpyArray array;
   array.name = name;
   uint64_t size = 0;
-  const std::string start = zip_.readStart(member, kMaxHeaderBytes, &size);
+  const std::string start = zip_.readStart(member, kMaxNpyHeaderBytes, &size);
   const std::string where = joinText(operation_, ": ", path(), ": ", name, ": ");
   const std::string_view header = headerOf(start, &array.begin);
   const std::string_view type = valueOf(header, "descr"), order = valueOf(header, "fortran_order"),
@@ -120,7 +120,7 @@ std::optional<NpyArray> NpzFile::describe(const std::string& name) const {
 
 std::optional<NpyArray> NpzFile::read(const std::string& name) const {
   std::optional<NpyArray> array = describe(name);
-  if (array) array->bytes = zip_.read(name + ".npy", kMaxArrayBytes + kMaxHeaderBytes);
+  if (array) array->bytes = zip_.read(name + ".npy", kMaxArrayBytes + kMaxNpyHeaderBytes);
   return array;
 }
 

@@ -151,8 +151,8 @@ Geometry describeGeometry(const NpzFile& npz, int64_t views) {
     requireShape(npz, *g.points, {views, -1, -1, 3}, "(S, H, W, 3)");
   const NpyArray& array = g.depth ? *g.depth : *g.points;
   g.height = array.shape[1], g.width = array.shape[2];
-  require(g.width > 0 && g.height > 0 && g.pixels() <= kMaxViewPixels, kReadViews, ": ", npz.path(),
-          ": expected 1 to 2^28 pixels, found ", g.width, " x ", g.height);
+  require(g.width > 0 && g.height > 0 && g.pixels() <= kMaxImagePixels, kReadViews, ": ",
+          npz.path(), ": expected 1 to 2^28 pixels, found ", g.width, " x ", g.height);
   for (const char* name : {g.depth ? "depth_conf" : "world_points_conf", "conf"})
     if (!g.confidence) g.confidence = npz.describe(name);
   if (g.confidence) requireShape(npz, *g.confidence, {views, g.height, g.width}, "(S, H, W)");

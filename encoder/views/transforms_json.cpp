@@ -172,7 +172,7 @@ Camera jsonCamera(const Keys& keys, int image_width, int image_height, const std
 std::optional<std::pair<int, int>> statedSize(const Keys& keys) {
   const auto w = keys.number("w"), h = keys.number("h");
   if (!w || !h) return {};
-  require(*w >= 1 && *h >= 1 && *w * *h <= double(kMaxViewPixels) && *w == std::floor(*w) &&
+  require(*w >= 1 && *h >= 1 && *w * *h <= double(kMaxImagePixels) && *w == std::floor(*w) &&
               *h == std::floor(*h),
           kReadViews, ": ", keys.where, ": expected 1 to 2^28 pixels, found ", *w, " x ", *h);
   return std::pair(int(*w), int(*h));
@@ -190,8 +190,8 @@ Eigen::Isometry3d jsonPose(const Keys& keys, const Applied& applied) {
 }
 
 /// Throws Error unless a picture that belongs to another has its size.
-void requireSameSize(const std::string& file, const char* what, int width, int height,
-                     const Camera& camera, const std::string& image_file) {
+void requireSizeOfImage(const std::string& file, const char* what, int width, int height,
+                        const Camera& camera, const std::string& image_file) {
   require(width == camera.width && height == camera.height, kReadViews, ": ", file, ": ", what,
           " and colour differ in size (expected ", camera.width, " x ", camera.height, " as ",
           image_file, ", found ", width, " x ", height, ")");
@@ -206,7 +206,7 @@ std::vector<float> jsonDepth(const Keys& keys, const fs::path& folder, const Cam
   const std::string depth_file = imagePath(folder, *path);
   int width = 0, height = 0;
   const std::vector<uint16_t> stored = readPng16(depth_file, &width, &height);
-  requireSameSize(depth_file, "depth", width, height, camera, image_file);
+  requireSizeOfImage(depth_file, "depth", width, height, camera, image_file);
   const double unit = keys.number("depth_unit_scale_factor").value_or(1e-3);
   require(unit > 0, kReadViews, ": ", keys.where,
           ": depth_unit_scale_factor: expected more than 0, found ", unit);
@@ -218,7 +218,7 @@ std::vector<float> jsonDepth(const Keys& keys, const fs::path& folder, const Cam
   if (!mask_path || mask_path->empty()) return depth;
   const std::string mask_file = imagePath(folder, *mask_path);
   const Image mask = readImage(mask_file);
-  requireSameSize(mask_file, "mask", mask.width, mask.height, camera, image_file);
+  requireSizeOfImage(mask_file, "mask", mask.width, mask.height, camera, image_file);
   const size_t channels = size_t(mask.channels);
   for (size_t i = 0; i < depth.size(); ++i) {
     const float* m = mask.data.data() + i * channels;
@@ -273,7 +273,7 @@ Eigen::Vector3d transformsUp(const std::string& path) {
 
 namespace {
 
-void requireWritable(const char* operation, const std::string& path, const View& view) {
+void requireWritableView(const char* operation, const std::string& path, const View& view) {
   const Camera& c = view.camera;
   const size_t pixels = size_t(std::max(c.width, 0)) * size_t(std::max(c.height, 0));
   require(pixels > 0 && view.colour.width == c.width && view.colour.height == c.height &&
@@ -316,7 +316,7 @@ void writeViews(const std::vector<View>& views, const std::string& folder) {
   json["frames"] = Json::array();
   for (size_t i = 0; i < views.size(); ++i) {
     const View& view = views[i];
-    requireWritable(kOperation, folder, view);
+    requireWritableView(kOperation, folder, view);
     char number[32];
     std::snprintf(number, sizeof(number), "%05zu.png", i);
     const std::string colour_path = std::string("color/") + number;

@@ -12,7 +12,6 @@
 namespace vdbc {
 
 constexpr const char* kReadViews = "readViews";
-constexpr uint64_t kMaxViewPixels = uint64_t(1) << 28;
 constexpr float kFarDepth = 1e9f;  // renderers fill empty pixels with 1e10 and the like
 
 /// The rigid transform nearest to `m`: the rotation of its polar decomposition. Throws Error unless

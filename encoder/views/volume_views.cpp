@@ -26,7 +26,7 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
-constexpr uint64_t kMaxFileBytes = uint64_t(1) << 32;
+constexpr uint64_t kMaxVolumeBytes = uint64_t(1) << 32;
 constexpr uint64_t kMaxBlocks = uint64_t(1) << 20;  // of 8^3 voxels: 2 GiB of values
 constexpr double kMinVoxelM = 1e-4, kMaxVoxelM = 100;
 constexpr double kMaxShear = 1e-3;  // files by others keep transforms in float
@@ -212,7 +212,7 @@ Vector3d upOf(const VdbFile& file, const FloatGrid& field,
 
 /// What the file holds; the surface is still to be found.
 Volume loadVolume(const std::string& path) {
-  const VdbFile file = readVdb(kReadViews, path, kMaxFileBytes);
+  const VdbFile file = readVdb(kReadViews, path, kMaxVolumeBytes);
   Volume v;
   v.field = geometryGrid(file.grids, path);
   v.is_level_set = v.field->getGridClass() == openvdb::GRID_LEVEL_SET;

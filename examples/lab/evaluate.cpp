@@ -469,7 +469,7 @@ void writeColumns(const std::vector<std::vector<Image>>& columns, const std::str
 }
 
 namespace {
-const std::vector<Score<MethodResult>> kScores = {
+const std::vector<Score<MethodResult>> kMethodScores = {
     {"psnr", &MethodResult::psnr},
     {"ssim", &MethodResult::ssim},
     {"flip", &MethodResult::flip},
@@ -512,7 +512,7 @@ const std::vector<Score<MethodResult>> kScores = {
     {"peak_rss_mb", &MethodResult::peak_rss_mb}};
 }  // namespace
 
-std::string resultJson(const MethodResult& r) { return scoresJson(r, kScores); }
+std::string resultJson(const MethodResult& r) { return scoresJson(r, kMethodScores); }
 
 std::string reliabilityJson(const MethodResult& r) {
   nlohmann::ordered_json bins = nlohmann::ordered_json::array();
@@ -620,7 +620,7 @@ std::vector<MethodResult> evaluateScene(const EvaluationScene& scene, const Enco
 }
 
 std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results) {
-  std::vector<MethodResult> means = summaries(results, kScores, "mean", meanOf);
+  std::vector<MethodResult> means = summaries(results, kMethodScores, "mean", meanOf);
   for (MethodResult& mean : means) {
     for (const MethodResult& r : results) {
       if (r.method != mean.method) continue;
@@ -644,7 +644,7 @@ std::vector<MethodResult> meanResults(const std::vector<MethodResult>& results) 
 }
 
 std::vector<MethodResult> deviationResults(const std::vector<MethodResult>& results) {
-  return summaries(results, kScores, "std", deviationOf);
+  return summaries(results, kMethodScores, "std", deviationOf);
 }
 
 }  // namespace vdbc

@@ -22,7 +22,7 @@ constexpr int32_t kMagic = 0x33444256;  // "VBD3"
 constexpr size_t kTokenBytes = 3 * sizeof(int16_t) + kPackedDim;
 constexpr uint64_t kMaxFileBytes = 1 << 24, kMaxRoomBytes = 1 << 27;
 constexpr uint64_t kMaxDecoderBytes = 1 << 27;  // twice what the strongest preset asks for
-constexpr int kMaxSide = 1024;                  // nodes
+constexpr int kMaxRoomSide = 1024;              // nodes
 constexpr const char* kEncoderFile = "encoder_hash";
 
 // --- compressed files
@@ -120,7 +120,7 @@ class Reader {
     take(b, sizeof(b));
     for (int axis = 0; axis < 3; ++axis)
       expect(std::abs(int64_t(b[axis])) < std::numeric_limits<int16_t>::max() &&
-                 b[3 + axis] >= b[axis] && int64_t(b[3 + axis]) - b[axis] < 4 * kMaxSide,
+                 b[3 + axis] >= b[axis] && int64_t(b[3 + axis]) - b[axis] < 4 * kMaxRoomSide,
              "a box of some voxels, found ", b[axis], " to ", b[3 + axis]);
     return {Coord(b[0], b[1], b[2]), Coord(b[3], b[4], b[5])};
   }

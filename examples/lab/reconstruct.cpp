@@ -89,7 +89,7 @@ PictureError meanError(const JudgedViews& judged, const Gaussians& gaussians, si
   return mean;
 }
 
-constexpr size_t kShownViews = 2;  // of each kind
+constexpr size_t kShownViewsOfKind = 2;
 
 template <typename T>
 Tensor parameterOf(const std::vector<T>& values, at::IntArrayRef shape) {
@@ -103,7 +103,7 @@ void copyBack(const Tensor& from, std::vector<T>* to) {
   std::memcpy(static_cast<void*>(to->data()), from.data_ptr<float>(), from.nbytes());
 }
 
-const std::vector<Score<ReconstructionResult>> kScores = {
+const std::vector<Score<ReconstructionResult>> kReconstructionScores = {
     {"input_psnr", &ReconstructionResult::input_psnr},
     {"input_ssim", &ReconstructionResult::input_ssim},
     {"input_flip", &ReconstructionResult::input_flip},
@@ -124,11 +124,13 @@ const std::vector<Score<ReconstructionResult>> kScores = {
 
 }  // namespace
 
-std::string reconstructionJson(const ReconstructionResult& r) { return scoresJson(r, kScores); }
+std::string reconstructionJson(const ReconstructionResult& r) {
+  return scoresJson(r, kReconstructionScores);
+}
 
 std::vector<ReconstructionResult> meanReconstructions(
     const std::vector<ReconstructionResult>& results) {
-  return summaries(results, kScores, "mean", meanOf);
+  return summaries(results, kReconstructionScores, "mean", meanOf);
 }
 
 Gaussians voxelMean(const Observation& o, int per_voxel) {
@@ -239,7 +241,7 @@ std::vector<ReconstructionResult> evaluateReconstruction(
   std::vector<ReconstructionResult> results;
   std::vector<std::vector<Image>> columns(1);
   for (const JudgedViews* j : {&input, &others})
-    for (size_t i = 0; i < std::min(kShownViews, j->views.size()); ++i)
+    for (size_t i = 0; i < std::min(kShownViewsOfKind, j->views.size()); ++i)
       columns[0].push_back(j->views[i].colour);
   auto measure = [&](const char* method, const Gaussians& gaussians,
                      double seconds) -> ReconstructionResult& {
@@ -248,8 +250,8 @@ std::vector<ReconstructionResult> evaluateReconstruction(
     r.scene = scene.name, r.method = method, r.views = int(scene.input.size()),
     r.gaussians = gaussians.size();
     columns.emplace_back();
-    const PictureError a = meanError(input, gaussians, kShownViews, &columns.back());
-    const PictureError b = meanError(others, gaussians, kShownViews, &columns.back());
+    const PictureError a = meanError(input, gaussians, kShownViewsOfKind, &columns.back());
+    const PictureError b = meanError(others, gaussians, kShownViewsOfKind, &columns.back());
     r.input_psnr = a.psnr, r.input_ssim = a.ssim, r.input_flip = a.flip;
     r.other_seen_psnr = meanError(others_seen, gaussians, 0, nullptr).psnr;
     r.other_psnr = b.psnr, r.other_ssim = b.ssim, r.other_flip = b.flip;

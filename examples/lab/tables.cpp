@@ -16,26 +16,26 @@ namespace {
 using Lines = std::vector<const ResultLine*>;
 
 // How tables show a score.
-struct Column {
+struct TableColumn {
   std::string score, head;
   int digits;
 };
 
-Column columnOf(const std::string& score) {
-  static const std::vector<Column> known = {{"psnr", "PSNR", 2},
-                                            {"ssim", "SSIM", 3},
-                                            {"flip", "FLIP", 3},
-                                            {"shell_recall", "of the shell", 3},
-                                            {"f1", "F1", 3},
-                                            {"furniture_recall", "of furniture", 3},
-                                            {"iou", "IoU", 3},
-                                            {"outside", "outside", 0},
-                                            {"ece", "ECE", 3},
-                                            {"seconds", "s", 2},
-                                            {"lpips", "LPIPS", 3},
-                                            {"peak_rss_mb", "peak MB", 0},
-                                            {"gaussians", "Gaussians", 0}};
-  for (const Column& c : known)
+TableColumn columnOf(const std::string& score) {
+  static const std::vector<TableColumn> known = {{"psnr", "PSNR", 2},
+                                                 {"ssim", "SSIM", 3},
+                                                 {"flip", "FLIP", 3},
+                                                 {"shell_recall", "of the shell", 3},
+                                                 {"f1", "F1", 3},
+                                                 {"furniture_recall", "of furniture", 3},
+                                                 {"iou", "IoU", 3},
+                                                 {"outside", "outside", 0},
+                                                 {"ece", "ECE", 3},
+                                                 {"seconds", "s", 2},
+                                                 {"lpips", "LPIPS", 3},
+                                                 {"peak_rss_mb", "peak MB", 0},
+                                                 {"gaussians", "Gaussians", 0}};
+  for (const TableColumn& c : known)
     if (c.score == score) return c;
   return {score, score, 3};
 }
@@ -151,7 +151,7 @@ void forEachCurvePoint(const Lines& lines, const Add& add) {
 }
 
 // Mean of the differences over the scenes that both have, and its standard error.
-std::string differenceTo(const Lines& base, const Lines& lines, const Column& column) {
+std::string differenceTo(const Lines& base, const Lines& lines, const TableColumn& column) {
   std::vector<double> differences;
   for (const ResultLine* line : lines)
     for (const ResultLine* other : base) {
@@ -259,7 +259,7 @@ std::string reliabilityCsv(const std::vector<ResultLine>& lines) {
 std::string comparisonTable(const std::vector<NamedResults>& configurations,
                             const std::string& method, const std::vector<std::string>& scores) {
   std::vector<std::string> head = {""};
-  std::vector<Column> compared;
+  std::vector<TableColumn> compared;
   for (const std::string& score : scores) head.push_back(columnOf(score).head);
   for (const char* score : {"f1", "psnr"})
     if (std::find(scores.begin(), scores.end(), score) != scores.end()) {
@@ -275,7 +275,7 @@ std::string comparisonTable(const std::vector<NamedResults>& configurations,
       const std::vector<double> values = valuesOf(lines, score);
       cells.push_back(values.empty() ? "" : fixed(meanOf(values), columnOf(score).digits));
     }
-    for (const Column& column : compared) cells.push_back(differenceTo(base, lines, column));
+    for (const TableColumn& column : compared) cells.push_back(differenceTo(base, lines, column));
     text += rowOf(cells);
   }
   return text;

@@ -24,7 +24,6 @@ using Eigen::Matrix3d;
 using Eigen::Vector3d;
 using Eigen::Vector3f;
 using Face = ObjFile::Face;
-using Finish = ObjFile::Finish;
 
 constexpr int kMaxTextureSide = 1024;  // larger ones are halved: no picture of a room shows more
 constexpr size_t kMaxTriangles = 400000;
@@ -124,12 +123,12 @@ Vector3f meanColour(const Texture& texture) {
 }
 
 /// A material as a window's pane or a mirror, which Sweet Home 3D knows by the name of the group.
-Material finished(Material m, Finish finish) {
-  if (finish == Finish::kPane) {
+Material finished(Material m, ObjFile::Finish finish) {
+  if (finish == ObjFile::Finish::kPane) {
     m.opacity = std::min(m.opacity, .3f);
     m.specular = std::max(m.specular, .04f);
     m.roughness = .05f;
-  } else if (finish == Finish::kMirror) {
+  } else if (finish == ObjFile::Finish::kMirror) {
     m.colour_a.setConstant(.03f);
     m.texture = nullptr;
     m.specular = .85f;
@@ -254,7 +253,7 @@ void AssetLibrary::Impl::fillMaterials(const ObjFile& obj, size_t model, ReadMes
   std::set<int> has_uv;
   for (const Face& face : obj.faces)
     if (face.corner[0].uv >= 0) has_uv.insert(face.material);
-  std::map<std::pair<int, Finish>, int32_t> index;
+  std::map<std::pair<int, ObjFile::Finish>, int32_t> index;
   size_t without = 0;  // triangles whose material is not defined
   for (const Face& face : obj.faces) {
     const int id = face.material;

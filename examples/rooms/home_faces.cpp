@@ -10,7 +10,6 @@ using Eigen::Vector2d;
 using Eigen::Vector2f;
 using Eigen::Vector3d;
 using Eigen::Vector3f;
-using Finish = Home::Finish;
 using Outline = Home::Outline;
 
 bool triangleContains(const Vector2d& a, const Vector2d& b, const Vector2d& c, const Vector2d& p) {
@@ -55,7 +54,7 @@ Outline clipped(const Outline& polygon, const std::function<double(const Vector2
 }
 
 void FaceBuilder::add(const std::vector<Vector3d>& corners, const Vector3d& outward,
-                      const Finish& finish) {
+                      const Home::Finish& finish) {
   Vector3d normal = Vector3d::Zero();
   for (size_t i = 1; i + 1 < corners.size(); ++i)
     normal += (corners[i] - corners[0]).cross(corners[i + 1] - corners[0]);
@@ -88,7 +87,7 @@ void FaceBuilder::add(const std::vector<Vector3d>& corners, const Vector3d& outw
 
 void FaceBuilder::addPane(const std::vector<Vector3d>& corners, const Vector3d& outward) {
   const size_t before = surface.mesh.triangles.size();
-  add(corners, outward, Finish());
+  add(corners, outward, Home::Finish());
   Material sky;
   sky.colour_a = {.72f, .86f, 1.f}, sky.emission = 2;
   surface.materials.push_back(sky);
@@ -96,7 +95,7 @@ void FaceBuilder::addPane(const std::vector<Vector3d>& corners, const Vector3d& 
     surface.material[i] = int32_t(surface.materials.size()) - 1;
 }
 
-int32_t FaceBuilder::materialOf(const Finish& finish) {
+int32_t FaceBuilder::materialOf(const Home::Finish& finish) {
   const std::array<float, 4> key{finish.colour.x(), finish.colour.y(), finish.colour.z(),
                                  float(finish.texture)};
   const auto [at, is_new] = materials_.try_emplace(key, int32_t(surface.materials.size()));

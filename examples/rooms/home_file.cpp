@@ -21,15 +21,11 @@ using Eigen::Vector2d;
 using Eigen::Vector3d;
 using Eigen::Vector3f;
 using Baseboard = Home::Baseboard;
-using Finish = Home::Finish;
-using Item = Home::Item;
 using Level = Home::Level;
 using Outline = Home::Outline;
 using Side = Home::Side;
 using Space = Home::Space;
-using Wall = Home::Wall;
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr char kExamples[] = "com/eteks/sweethome3d/io/resources/examples/";
 constexpr uint64_t kMostHomeBytes = 64 << 20;  // the largest example has 0.1 MB
 constexpr int kMostGroups = 16;                // of groups in groups
@@ -114,8 +110,8 @@ class HomeReader {
   }
 
   /// The texture child whose attribute is `texture`, or the colour, or the default.
-  Finish finish(pugi::xml_node node, const char* colour_name, const char* texture) const {
-    Finish result;
+  Home::Finish finish(pugi::xml_node node, const char* colour_name, const char* texture) const {
+    Home::Finish result;
     if (const auto c = colour(node, colour_name)) result.colour = *c;
     for (const pugi::xml_node child : node.children("texture")) {
       if (child.attribute("attribute").as_string() != std::string(texture)) continue;
@@ -155,7 +151,7 @@ class HomeReader {
   }
 
   void readWall(pugi::xml_node node) {
-    Wall wall;
+    Home::Wall wall;
     wall.id = node.attribute("id").value();
     wall.at_start = node.attribute("wallAtStart").value();
     wall.at_end = node.attribute("wallAtEnd").value();
@@ -218,7 +214,7 @@ class HomeReader {
   }
 
   void readItem(pugi::xml_node node) {
-    Item item;
+    Home::Item item;
     item.name = node.attribute("name").value();
     item.model = modelOf(node);
     item.level = levelOf(node);

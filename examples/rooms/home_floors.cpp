@@ -12,7 +12,6 @@ namespace {
 
 using Eigen::Vector2d;
 using Eigen::Vector3d;
-using Finish = Home::Finish;
 using Level = Home::Level;
 using Outline = Home::Outline;
 using Space = Home::Space;
@@ -26,7 +25,7 @@ double lowestAt(const std::vector<Plane>& planes, const Vector2d& p) {
 /// A narrow rim around a floor or ceiling, into the walls and `rise` up at its outer edge: outlines
 /// are drawn by hand and miss the walls by millimetres.
 void addRim(const Outline& outline, const std::vector<Plane>& planes, double rise,
-            const Finish& finish, FaceBuilder* faces) {
+            const Home::Finish& finish, FaceBuilder* faces) {
   constexpr double kWidth = .03;
   for (size_t i = 0, j = outline.size() - 1; i < outline.size(); j = i++) {
     const Vector2d a = outline[j], b = outline[i];

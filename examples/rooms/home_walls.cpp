@@ -11,12 +11,7 @@ namespace {
 
 using Eigen::Vector2d;
 using Eigen::Vector3d;
-using Finish = Home::Finish;
-using Item = Home::Item;
-using Wall = Home::Wall;
 using Baseboard = Home::Baseboard;
-
-constexpr double kPi = 3.14159265358979323846;
 
 /// Upper and lower edge of an SVG path with the commands M, v, h, a and z, which is all that the
 /// catalogues use, at `x`; the shapes have no overhangs.
@@ -35,7 +30,7 @@ std::optional<std::pair<double, double>> shapeSpan(const std::string& path, doub
       const double side = (numbers[4] > 0) == (width > 0) ? -1 : 1;
       const Vector2d middle = at + Vector2d(width / 2, numbers[6] / 2);
       for (int i = 1; i <= 24; ++i) {
-        const double a = kPi * i / 24;
+        const double a = M_PI * i / 24;
         points.push_back(middle + Vector2d(-width / 2 * std::cos(a), side * height * std::sin(a)));
       }
       at += Vector2d(numbers[5], numbers[6]);
@@ -68,7 +63,7 @@ std::optional<std::pair<double, double>> shapeSpan(const std::string& path, doub
   return std::pair(std::clamp(low, 0., 1.), std::clamp(high, 0., 1.));
 }
 
-Hole holeOf(const Item& item, double level_elevation) {
+Hole holeOf(const Home::Item& item, double level_elevation) {
   Hole hole;
   hole.centre = item.place, hole.axis = {std::cos(item.angle), std::sin(item.angle)};
   const bool is_round = item.cut_shape.find('a') != std::string::npos;
@@ -76,7 +71,7 @@ Hole holeOf(const Item& item, double level_elevation) {
   const int steps = is_round ? 24 : 1;
   for (int i = 0; i <= steps; ++i) {
     // Cosine spacing: fine where an arch is steep.
-    const double x = is_round ? .5 - .5 * std::cos(kPi * i / steps) : i;
+    const double x = is_round ? .5 - .5 * std::cos(M_PI * i / steps) : i;
     const auto span =
         is_round ? shapeSpan(item.cut_shape, std::clamp(x, 1e-7, 1 - 1e-7)) : std::nullopt;
     hole.cuts.push_back({(x - .5) * item.size.x(), bottom + height * (span ? 1 - span->second : 0),
@@ -90,7 +85,7 @@ struct WallLines {
   std::vector<Vector2d> left, right;
 };
 
-WallLines unjoined(const Wall& wall) {
+WallLines unjoined(const Home::Wall& wall) {
   WallLines lines;
   const Vector2d chord = wall.end - wall.start, d = chord.normalized();
   const double half = wall.thickness / 2;
@@ -101,7 +96,7 @@ WallLines unjoined(const Wall& wall) {
   }
   const Vector2d centre =
       (wall.start + wall.end) / 2 + leftOf(d) * (chord.norm() / 2 / std::tan(wall.arc / 2));
-  const int steps = std::clamp(int(std::ceil(std::abs(wall.arc) / (kPi / 48))), 2, 96);
+  const int steps = std::clamp(int(std::ceil(std::abs(wall.arc) / (M_PI / 48))), 2, 96);
   for (int i = 0; i <= steps; ++i) {
     const Vector2d from_centre =
         Eigen::Rotation2Dd(wall.arc * i / steps) * Vector2d(wall.start - centre);
@@ -123,13 +118,13 @@ Vector2d corner(const Vector2d& p, const Vector2d& d, const Vector2d& q, const V
 }
 
 /// Mitres one end of `wall` with the neighbour that names it: the outer lines meet, the inner too.
-void joinEnd(const std::vector<Wall>& walls, const std::vector<WallLines>& lines, size_t index,
-             bool at_end, WallLines* joined) {
-  const Wall& wall = walls[index];
+void joinEnd(const std::vector<Home::Wall>& walls, const std::vector<WallLines>& lines,
+             size_t index, bool at_end, WallLines* joined) {
+  const Home::Wall& wall = walls[index];
   const std::string& other_id = at_end ? wall.at_end : wall.at_start;
   if (other_id.empty()) return;
-  const auto other =
-      std::find_if(walls.begin(), walls.end(), [&](const Wall& w) { return w.id == other_id; });
+  const auto other = std::find_if(walls.begin(), walls.end(),
+                                  [&](const Home::Wall& w) { return w.id == other_id; });
   if (other == walls.end() || other->level != wall.level || &*other == &wall) return;
   const Vector2d mine = at_end ? wall.end : wall.start;
   const bool by_start = other->at_start == wall.id, by_end = other->at_end == wall.id;
@@ -183,7 +178,7 @@ std::vector<std::array<double, 4>> gapsBetween(const Stretch& s, const Vector2d 
 void addSide(const Stretch& s, bool left, FaceBuilder* faces) {
   const Vector2d a = left ? s.left[0] : s.right[0], b = left ? s.left[1] : s.right[1];
   const Vector2d outward = leftOf(s.direction()) * (left ? 1 : -1);
-  const Finish& finish = (left ? s.wall->left : s.wall->right).finish;
+  const Home::Finish& finish = (left ? s.wall->left : s.wall->right).finish;
   std::vector<double> cuts{0, 1};
   for (const Hole& hole : s.holes)
     for (const Hole::Cut& cut : hole.cuts) {
@@ -211,7 +206,7 @@ void addSide(const Stretch& s, bool left, FaceBuilder* faces) {
 }
 
 /// The faces inside a hole, from one side of the wall to the other.
-void addReveal(const Stretch& s, const Hole& hole, const Finish& finish, FaceBuilder* faces) {
+void addReveal(const Stretch& s, const Hole& hole, const Home::Finish& finish, FaceBuilder* faces) {
   const auto at = [&](bool left, double x) {  // share of the side's length, and the place
     const Vector2d a = left ? s.left[0] : s.right[0], b = left ? s.left[1] : s.right[1];
     const double t = std::clamp((x - hole.x(a)) / (hole.x(b) - hole.x(a)), 0., 1.);
@@ -284,10 +279,10 @@ void addBaseboard(const Stretch& s, bool left, FaceBuilder* faces) {
 
 std::vector<Stretch> stretchesOf(const Home& home) {
   std::vector<WallLines> lines;
-  for (const Wall& wall : home.walls) lines.push_back(unjoined(wall));
+  for (const Home::Wall& wall : home.walls) lines.push_back(unjoined(wall));
   std::vector<Stretch> stretches;
   for (size_t i = 0; i < home.walls.size(); ++i) {
-    const Wall& wall = home.walls[i];
+    const Home::Wall& wall = home.walls[i];
     WallLines joined = lines[i];
     joinEnd(home.walls, lines, i, false, &joined);
     joinEnd(home.walls, lines, i, true, &joined);
@@ -312,7 +307,7 @@ std::vector<Stretch> stretchesOf(const Home& home) {
 
 std::vector<WallOpening> cutOpenings(const Home& home, std::vector<Stretch>* stretches) {
   std::vector<WallOpening> openings;
-  for (const Item& item : home.items) {
+  for (const Home::Item& item : home.items) {
     if (!item.is_opening) continue;
     WallOpening opening{&item, holeOf(item, home.levels[size_t(item.level)].elevation)};
     const Hole& hole = opening.hole;
@@ -347,7 +342,7 @@ void addStretch(const Stretch& s, FaceBuilder* faces) {
   addSide(s, false, faces);
   addBaseboard(s, true, faces);
   addBaseboard(s, false, faces);
-  const Finish& finish = s.wall->left.finish;
+  const Home::Finish& finish = s.wall->left.finish;
   const auto top = [&](const Vector2d& p) { return lifted(p, s.topAt(p)); };
   faces->add({top(s.left[0]), top(s.left[1]), top(s.right[1]), top(s.right[0])}, Vector3d::UnitZ(),
              finish);

@@ -17,16 +17,13 @@ using Eigen::Vector2d;
 using Eigen::Vector2f;
 using Eigen::Vector3d;
 using Eigen::Vector3f;
-using Item = Home::Item;
 using Level = Home::Level;
 using Outline = Home::Outline;
 using Space = Home::Space;
 
-constexpr double kPi = 3.14159265358979323846;
-
 /// World from the model frame. Sweet Home 3D turns the model, fitted to its size and centred, by
 /// its pitch or roll, then by its angle; in x right, y up, z to the front.
-Eigen::Affine3f worldFromModel(const Home& home, const Item& item, const SurfaceMesh& mesh) {
+Eigen::Affine3f worldFromModel(const Home& home, const Home::Item& item, const SurfaceMesh& mesh) {
   Eigen::AlignedBox3d box;
   for (const Vector3f& v : mesh.mesh.vertices) box.extend(v.cast<double>());
   Eigen::Matrix3d upright, world;
@@ -50,7 +47,7 @@ Eigen::Affine3f worldFromModel(const Home& home, const Item& item, const Surface
 }
 
 /// The model in the item's own colours: one for all of it but its glass, or some materials'.
-SurfaceMesh coloured(const SurfaceMesh& mesh, const Item& item) {
+SurfaceMesh coloured(const SurfaceMesh& mesh, const Home::Item& item) {
   SurfaceMesh result = mesh;
   for (Material& material : result.materials) {
     const auto named = item.material_colours.find(material.name);
@@ -64,7 +61,7 @@ SurfaceMesh coloured(const SurfaceMesh& mesh, const Item& item) {
 
 /// An item where it stands.
 struct Placed {
-  const Item* item = nullptr;
+  const Home::Item* item = nullptr;
   Eigen::Affine3f world_from_model = Eigen::Affine3f::Identity();
   Eigen::AlignedBox3f box;  // world
 };
@@ -95,7 +92,7 @@ struct Plan {
       if (space.ceiling_visible && elevation(space.level) >= elevation(level) &&
           isInside(space.outline, p))
         return true;
-    for (const Item& item : home.items) {
+    for (const Home::Item& item : home.items) {
       const Vector2d axis(std::cos(item.angle), std::sin(item.angle)), from = p - item.place;
       if (item.size.head<2>().minCoeff() > 1.5 && std::abs(axis.dot(from)) < item.size.x() / 2 &&
           std::abs(cross(axis, from)) < item.size.y() / 2 &&
@@ -112,7 +109,7 @@ struct Plan {
     });
   }
 
-  bool holds(const Space& space, const Item& item) const {
+  bool holds(const Space& space, const Home::Item& item) const {
     return elevation(item.level) == elevation(space.level) && isInside(space.outline, item.place);
   }
 
@@ -134,7 +131,7 @@ struct Plan {
   std::vector<const Space*> furnishedRooms() const {
     std::vector<const Space*> furnished;
     for (const Space* space : rooms)
-      if (std::count_if(home.items.begin(), home.items.end(), [&](const Item& item) {
+      if (std::count_if(home.items.begin(), home.items.end(), [&](const Home::Item& item) {
             return !item.is_opening && holds(*space, item);
           }) >= 2)
         furnished.push_back(space);
@@ -197,7 +194,7 @@ bool isWindow(const ModelInfo& info, const SurfaceMesh& mesh) {
 /// Outside light behind a window: the sky to look at, and a light of the window's size before it.
 void addDaylight(const Plan& plan, const WallOpening& opening, FaceBuilder* faces,
                  std::vector<RoomLight>* lights) {
-  const Item& item = *opening.item;
+  const Home::Item& item = *opening.item;
   const Vector2d across = leftOf(opening.hole.axis);
   const bool is_back_in = plan.isIndoors(item.level, item.place + (opening.back + .3) * across);
   const bool is_front_in = plan.isIndoors(item.level, item.place + (opening.front - .3) * across);
@@ -227,7 +224,7 @@ void addLamps(const ModelInfo& info, const Placed& placed, std::vector<RoomLight
   if (placed.item->power <= 0) return;
   for (const ModelLight& lamp : info.lights) {
     // Of the same intensity whatever its size; the examples have power .5.
-    constexpr float kIntensity = 2.4f, kPiF = float(kPi);
+    constexpr float kIntensity = 2.4f, kPiF = float(M_PI);
     RoomLight light;
     light.centre = placed.world_from_model * lamp.centre;
     // The shade is what shines, as in furnished rooms.
@@ -255,7 +252,7 @@ Built build(const AssetLibrary& assets, const Plan& plan, int level) {
       addDaylight(plan, opening, &faces, &built.lights);
   built.surface = std::move(faces.surface);
   built.is_shell.assign(built.surface.mesh.triangles.size(), 1);
-  for (const Item& item : plan.home.items) {
+  for (const Home::Item& item : plan.home.items) {
     if (!levels.count(item.level)) continue;
     const SurfaceMesh mesh = coloured(*assets.mesh(item.model), item);
     Placed placed{&item, worldFromModel(plan.home, item, mesh), {}};
@@ -306,7 +303,7 @@ std::vector<RoomLight> lightsInSight(const Room& room) {
     const Vector3f origin(p.x(), p.y(), .2f + 1.8f * z);
     if (!isFree(room, origin, .05f)) continue;
     for (int i = 0; i < kRays; ++i) {
-      const float cosine = 2 * uniform() - 1, turn = 2 * float(kPi) * uniform();
+      const float cosine = 2 * uniform() - 1, turn = 2 * float(M_PI) * uniform();
       const float sine = std::sqrt(1 - cosine * cosine);
       origins.push_back(room.world_from_room * origin);
       directions.emplace_back(sine * std::cos(turn), sine * std::sin(turn), cosine);

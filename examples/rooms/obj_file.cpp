@@ -18,7 +18,6 @@ using Eigen::Vector3d;
 using Eigen::Vector3f;
 using Corner = ObjFile::Corner;
 using Face = ObjFile::Face;
-using Finish = ObjFile::Finish;
 
 constexpr size_t kMaxReadTriangles = 4000000;
 constexpr size_t kMaxPolygonCorners = 1024;
@@ -193,9 +192,9 @@ ObjFile readObj(const CatalogueZip& zip, const std::string& entry) {
     const std::string name = count > 0 ? names[0] : "";
     const bool is_pane = name.compare(0, 23, "sweethome3d_window_pane") == 0,
                is_mirror = name.compare(0, 25, "sweethome3d_window_mirror") == 0;
-    static_cast<ObjFile*>(data)->finish = is_pane     ? Finish::kPane
-                                          : is_mirror ? Finish::kMirror
-                                                      : Finish::kOwn;
+    static_cast<ObjFile*>(data)->finish = is_pane     ? ObjFile::Finish::kPane
+                                          : is_mirror ? ObjFile::Finish::kMirror
+                                                      : ObjFile::Finish::kOwn;
   };
   ObjFile obj;
   CatalogueMaterials reader(zip, entry);

@@ -1,5 +1,0 @@
-// See grid_instances.h.
-#include "vdb/grid_instances.h"
-
-template class openvdb::tree::Tree<vdbc::BoolTree::RootNodeType>;
-template class openvdb::Grid<vdbc::BoolTree>;
