@@ -126,7 +126,10 @@ std::vector<Coord> openGate(CompleterNet& net, float coarse_tau, GrowthScene* sc
   // The open nodes, all of them, and those whose neighbours are still to be looked at.
   TokenMask open, beside;  // `beside`: neighbours of open nodes
   std::vector<Coord> found = scene->tokens.coarse_filled;
-  for (const Coord& c : found) scene->gate.set(c, 1), open.setValueOn(c);
+  for (const Coord& c : found) {
+    scene->gate.set(c, 1);
+    if (1 > coarse_tau) open.setValueOn(c);
+  }
   const auto openNode = [&](const Coord& c) {
     const float* p = scene->gate.find(c);
     if (!p || !(*p > coarse_tau) || open.isValueOn(c)) return;

@@ -35,9 +35,9 @@ struct GrowthScene {
 GrowthScene growthScene(const Place& start, const CompleterConfig& config);
 
 /// Asks the coarse stage wherever growth can get to: chunks of unknown nodes that touch what is
-/// filled, then those that touch an open node. A node is open where it is filled, or where its
-/// probability exceeds `coarse_tau` and an open node touches it: nothing grows out of nothing.
-/// The open nodes, by x, then y, then z.
+/// filled, then those that touch an open node. A node is open where its probability exceeds
+/// `coarse_tau` and it is filled or an open node touches it: nothing grows out of nothing. The open
+/// nodes, by x, then y, then z.
 std::vector<Coord> openGate(CompleterNet& net, float coarse_tau, GrowthScene* scene,
                             Progress& progress);
 
