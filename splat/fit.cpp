@@ -19,7 +19,7 @@ constexpr float kAlphaLoss = .1f, kDepthLoss = .02f;
 constexpr float kBeta1 = .9f, kBeta2 = .99f;
 // Adam's rates at the start; they fall to a tenth. Means: in units of a Gaussian's largest sigma.
 constexpr float kMeanRate = .08f, kScaleRate = .1f, kRotationRate = .005f, kOpacityRate = .05f,
-                kColourRate = .001f / kSh0;
+                kColourRate = .002f / kSh0;
 constexpr float kLargestGrowth = .4f;  // of a logarithm of sigma
 constexpr int kHeldBack = 10;          // one block of 2 x 2 pixels in so many
 constexpr int kRound = 20;             // steps, at least, between looks at what is held back
