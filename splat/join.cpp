@@ -13,6 +13,7 @@
 #include "splat/merge.h"
 #include "splat/rasterize.h"
 #include "vdb/error.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 namespace {
@@ -236,7 +237,7 @@ SeenPlane consensus(const Gaussians& discs, const std::vector<DiscShape>& shapes
   for (size_t i : left) sums.push_back(sum += double(shapes[i].area));
   std::vector<SeenPlane> drawn(kPlaneDraws);
   for (SeenPlane& plane : drawn) {
-    const double at = sum * double((*random)() >> 11) * 0x1p-53;
+    const double at = sum * uniform(*random);
     const size_t k = size_t(std::upper_bound(sums.begin(), sums.end(), at) - sums.begin());
     const size_t i = left[std::min(k, left.size() - 1)];
     plane.point = discs.mean[i], plane.normal = shapes[i].normal;

@@ -11,6 +11,7 @@
 
 #include "splat/embree_device.h"
 #include "vdb/error.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 
@@ -75,8 +76,6 @@ void intersectCallback(const RTCIntersectFunctionNArguments* args) {
     RTCHitN_primID(hits, args->N, i) = args->primID;
   }
 }
-
-double uniform(std::mt19937_64& random) { return double(random() >> 11) * 0x1p-53; }
 
 struct RayBundle {
   std::vector<Eigen::Vector3f> origins, directions;

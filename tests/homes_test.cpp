@@ -11,6 +11,7 @@
 
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 namespace {
@@ -94,8 +95,6 @@ std::string window(double x, double elevation, double width, double height) {
                    "' depth='24' height='" + std::to_string(height) + "'",
                "doorOrWindow");
 }
-
-double uniform(std::mt19937_64& random) { return double(random() >> 11) / double(1ULL << 53); }
 
 /// Rays in all directions from the air of a room that hit nothing.
 int leaks(const Room& room, int count) {

@@ -11,6 +11,7 @@
 #include <tuple>
 
 #include "vdb/error.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 namespace {
@@ -23,7 +24,7 @@ constexpr double kInfinity = std::numeric_limits<double>::infinity();
 class Random {
  public:
   explicit Random(uint64_t seed) : engine_(seed) {}
-  double real(double a, double b) { return a + (b - a) * (double(engine_() >> 11) * 0x1p-53); }
+  double real(double a, double b) { return uniform(engine_, a, b); }
   Vector3d inBox(double half) {
     const double x = real(-half, half), y = real(-half, half);
     return {x, y, real(-half, half)};

@@ -9,6 +9,7 @@
 
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 namespace {
@@ -179,7 +180,6 @@ class BruteForce {
     const Material* material;
     double t;
   };
-  static double uniform(std::mt19937_64& random) { return double(random() >> 11) * 0x1p-53; }
   static Vector3d onSphere(std::mt19937_64& random) {
     const double z = 2 * uniform(random) - 1, a = 2 * M_PI * uniform(random),
                  r = std::sqrt(1 - z * z);
@@ -417,8 +417,8 @@ TEST(Render, EqualsBruteForce) {
       const Vector3d eye = c.world_from_camera.translation();
       Vector3d sum = Vector3d::Zero();
       for (int k = 0; k < kPaths; ++k) {
-        const double x = i % kWidth + double(random() >> 11) * 0x1p-53;
-        const double y = i / kWidth + double(random() >> 11) * 0x1p-53;
+        const double x = i % kWidth + uniform(random);
+        const double y = i / kWidth + uniform(random);
         sum += truth.radiance(eye, (c.unproject(x, y, 1) - eye).normalized(), random());
       }
       for (int k = 0; k < 3; ++k)

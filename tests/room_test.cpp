@@ -9,6 +9,7 @@
 #include "examples/rooms/floor_plan.h"
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 namespace {
@@ -204,7 +205,7 @@ TEST_F(RoomTest, RoomsAreClosed) {
     std::mt19937_64 random(7);
     for (const Vector3f& p : freePoints(room, 20, 5))
       for (int i = 0; i < 500; ++i) {
-        const auto unit = [&] { return float(double(random() >> 11) * 0x1p-53); };
+        const auto unit = [&] { return float(uniform(random)); };
         const float z = 2 * unit() - 1, phi = 2 * float(M_PI) * unit();
         const float r = std::sqrt(1 - z * z);
         origins.push_back(p), directions.emplace_back(r * std::cos(phi), r * std::sin(phi), z);

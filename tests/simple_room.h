@@ -3,6 +3,7 @@
 #include <random>
 
 #include "examples/rooms/rooms.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 
@@ -46,7 +47,7 @@ inline Room simpleRoom(uint64_t seed) {
   using Eigen::Vector3f;
   using Pattern = Material::Pattern;
   std::mt19937_64 random(seed);
-  const auto unit = [&] { return float(double(random() >> 11) * 0x1p-53); };
+  const auto unit = [&] { return float(uniform(random)); };
   const auto material = [&](Pattern pattern, float period) {
     Material m;
     m.pattern = pattern, m.period_m = period;

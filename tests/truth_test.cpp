@@ -12,6 +12,7 @@
 #include "tests/simple_room.h"
 #include "vdb/error.h"
 #include "vdb/grid_instances.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 namespace {
@@ -49,7 +50,7 @@ TEST(SurfaceNodes, HoldEveryPointOfTheSurface) {
       const Vector3d v = room.surface.mesh.vertices[size_t(t[2])].cast<double>() - a;
       const int samples = 2 + int(u.cross(v).norm() * 1500);
       for (int i = 0; i < samples; ++i) {
-        double p = double(random() >> 11) * 0x1p-53, q = double(random() >> 11) * 0x1p-53;
+        double p = uniform(random), q = uniform(random);
         if (p + q > 1) p = 1 - p, q = 1 - q;
         const Vector3d g = frame.toIndex(a + p * u + q * v);
         const Coord c(int(std::floor(g.x())) >> level, int(std::floor(g.y())) >> level,
@@ -88,7 +89,7 @@ double clippedArea(std::vector<Vector3d> polygon, const Vector3d& lo, const Vect
 
 TEST(SurfaceNodes, EqualExactClipping) {
   std::mt19937_64 random(9);
-  const auto real = [&] { return double(random() >> 11) * 0x1p-53 * 2 - 1; };
+  const auto real = [&] { return uniform(random) * 2 - 1; };
   const VoxelFrame frame = turnedFrame();
   for (int trial = 0; trial < 60; ++trial) {
     TriangleMesh mesh;

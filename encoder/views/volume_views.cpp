@@ -18,6 +18,7 @@
 
 #include "encoder/views/view_reading.h"
 #include "vdb/fit_volume.h"
+#include "vdb/uniform.h"
 #include "vdb/vdb_file.h"
 
 namespace vdbc {
@@ -398,8 +399,7 @@ std::vector<Vector3d> freePlaces(const Volume& volume) {
   for (int i = 0; i < kAttempts && places.size() < kMaxPlaces; ++i) {
     openvdb::Vec3d p;
     for (int axis = 0; axis < 3; ++axis)
-      p[axis] =
-          volume.bounds.min()[axis] + double(random() >> 11) * 0x1p-53 * volume.bounds.dim()[axis];
+      p[axis] = volume.bounds.min()[axis] + uniform(random) * volume.bounds.dim()[axis];
     // Clear of the surface, all corners of the point's cell are at its side.
     if (!caster.isFree(Coord::floor(p)) || !isClear(p)) continue;
     const Vector3d world = volume.world_from_index * Vector3d(p.x(), p.y(), p.z());

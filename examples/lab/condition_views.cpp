@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "vdb/fit_volume.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 namespace {
@@ -11,10 +12,7 @@ namespace {
 using Eigen::Vector3d;
 using Random = std::mt19937_64;
 
-// The standard's distributions differ between libraries; these do not.
-double uniform(Random& random, double low, double high) {
-  return low + (high - low) * (double(random() >> 11) * 0x1p-53);
-}
+// The standard's normal distribution differs between libraries.
 double normal(Random& random) {
   const double u = uniform(random, 1e-12, 1), v = uniform(random, 0, 1);
   return std::sqrt(-2 * std::log(u)) * std::cos(2 * M_PI * v);

@@ -8,6 +8,7 @@
 #include "examples/rooms/floor_plan.h"
 #include "examples/rooms/rooms.h"
 #include "vdb/error.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 namespace {
@@ -18,11 +19,6 @@ using Eigen::Vector3f;
 
 constexpr double kFieldOfView = 70. * M_PI / 180;  // vertical
 constexpr int kTriesPerCamera = 2000;
-
-// Our own mapping: that of <random> differs between standard libraries.
-double uniform(std::mt19937_64& random, double a, double b) {
-  return a + (b - a) * (double(random() >> 11) * 0x1p-53);
-}
 
 float distanceToOutline(const std::vector<Vector2f>& outline, const Vector2f& p) {
   float nearest = INFINITY;

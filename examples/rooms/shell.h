@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "examples/rooms/rooms.h"
+#include "vdb/uniform.h"
 
 namespace vdbc {
 
@@ -15,7 +16,7 @@ namespace vdbc {
 class Dice {
  public:
   explicit Dice(uint64_t seed) : engine_(seed) {}
-  float real(float a, float b) { return a + (b - a) * float(double(engine_() >> 11) * 0x1p-53); }
+  float real(float a, float b) { return a + (b - a) * float(uniform(engine_)); }
   int integer(int a, int b) { return a + int((engine_() >> 33) % uint64_t(b - a + 1)); }
   bool chance(float p) { return real(0, 1) < p; }
   template <typename T, size_t N>
