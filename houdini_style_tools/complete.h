@@ -76,8 +76,8 @@ struct Rethresholded {
 };
 /// Raises tau of a finished place without any network: `from`.vdb and `from`.points.vdb less the
 /// generated voxels and Gaussians whose probability does not exceed tau, also those that close
-/// holes, as `to`.vdb, `to`.points.vdb, `to`.ply. Throws Error where a file is missing or
-/// unreadable, and if every generated voxel exceeds tau.
+/// holes (no new ones are closed), as `to`.vdb, `to`.points.vdb, `to`.ply. Throws Error where a
+/// file is missing or unreadable, and if every generated voxel exceeds tau.
 Rethresholded rethreshold(const std::string& from, float tau, const std::string& to,
                           Progress& progress);
 

@@ -62,7 +62,8 @@ std::vector<Option> detailOptions(DetailSettings* s) {
 
 Option tauOption(CompleteSettings* settings) {
   return option("--tau P", &settings->tau,
-                "a token is kept above this probability: lower fills more, with more mistakes")
+                "a token is kept above this probability, unless it only thickens a surface: lower "
+                "fills more, with more mistakes")
       .between(0, 1);
 }
 Option fromLevelOption(CompleteSettings* settings) {

@@ -240,7 +240,8 @@ void cookRethreshold(const RethresholdOptions& o, const Run& run, Progress& prog
        {"output", stem}},
       joinText(r.voxels, " voxels, ", r.gaussians, " Gaussians; ", r.dropped_voxels,
                " voxels dropped\n", stem, ".vdb  ", stem, ".points.vdb  ", stem,
-               ".ply\nA new run with this tau differs a little: the decoder, and the "
+               ".ply\nA new run with this tau differs a little: it closes holes anew; the decoder, "
+               "and the "
                "completer with --generated-context, look at neighbours that are gone here."));
 }
 

@@ -56,7 +56,7 @@ Place Completer::complete(const Place& start, const CompleteSettings& s, Progres
       net, scene, unobservedChildren(open, scene.tokens.nodes), s,
       [&](float probability) { return probability > s.tau; }, progress, listener, &g, &dropped);
   thinSurfaces(&g, &dropped);
-  if (s.hole_tau < s.tau) closeHoles(net, scene.tokens.nodes, dropped, s.hole_tau, &g);
+  if (s.hole_tau < 1) closeHoles(net, scene.tokens.nodes, dropped, s.hole_tau, &g);
   if (s.refine_observed) refineObserved(net, scene, s, &g);
   progress.end();
   return std::move(g.place);

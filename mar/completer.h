@@ -12,10 +12,12 @@
 namespace vdbc {
 
 struct CompleteSettings {
-  float tau = .45f;        // a token is kept if its occupancy probability exceeds this
+  /// A token is kept if its occupancy probability exceeds this, unless it only thickens a surface
+  /// (docs/method.md, section 4.10).
+  float tau = .45f;
   float coarse_tau = .1f;  // the coarse stage's gate: high recall
-  /// Dropped tokens above this probability are taken back where they close a small hole (a minimum
-  /// cut between what was seen empty and the border of the volume); 1: none.
+  /// Dropped tokens, thinned ones too, above this probability are taken back where they close a
+  /// small hole (a minimum cut between what was seen empty and the border of the volume); 1: none.
   float hole_tau = .1f;
   Neighbours neighbours = Neighbours::kCorners26;
   int sampling_steps = 0;  // DDIM steps of the diffusion head; 0: its linear mean

@@ -13,9 +13,9 @@
 namespace vdbc {
 namespace {
 
-double uniform(torch::Generator& random) { return torch::rand({1}, random).item<double>(); }
-double uniform(double low, double high, torch::Generator& random) {
-  return low + (high - low) * uniform(random);
+double drawUniform(torch::Generator& random) { return torch::rand({1}, random).item<double>(); }
+double drawUniform(double low, double high, torch::Generator& random) {
+  return low + (high - low) * drawUniform(random);
 }
 
 std::vector<Coord> selectRandom(const std::vector<Coord>& from, double share,
@@ -32,9 +32,9 @@ std::vector<Coord> selectRandom(const std::vector<Coord>& from, double share,
 CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const SeenSpace& truth,
                           torch::Generator& random) {
   CoarseMask m;
-  const std::vector<Coord> worked_on = selectRandom(unknown, uniform(.3, 1, random), random);
+  const std::vector<Coord> worked_on = selectRandom(unknown, drawUniform(.3, 1, random), random);
   // Inference is one shot from the condition tokens; half of the samples train just that.
-  const double hidden = uniform(random) < .5 ? 1.0 : uniform(.5, 1, random);
+  const double hidden = drawUniform(random) < .5 ? 1.0 : drawUniform(.5, 1, random);
   const Tensor draws = torch::rand({int64_t(worked_on.size())}, random);
   for (size_t i = 0; i < worked_on.size(); ++i) {
     const bool shown =
@@ -47,15 +47,15 @@ CoarseMask drawCoarseMask(const std::vector<Coord>& unknown, const SeenSpace& tr
 FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSample& s,
                       const CompleterConfig& config, torch::Generator& random) {
   FineMask m;
-  const double kind = uniform(random);
+  const double kind = drawUniform(random);
   const double share = double(config.alone_share);
   const bool alone = kind < share, growth = kind < (1 + share) / 2;
   const std::vector<int32_t> levels = breadthFirstLevels(candidates, s.condition.ijk);
   const int32_t deepest = levels.empty() ? 1 : *std::max_element(levels.begin(), levels.end());
   const int32_t depth = int32_t(torch::randint(alone ? deepest : 6, {1}, random).item<int64_t>());
   const Tensor draws = torch::rand({int64_t(candidates.size()), 2}, random);
-  const double hidden = uniform(.5, 1, random);
-  const double wrong = uniform(0, config.context_false_positives, random);
+  const double hidden = drawUniform(.5, 1, random);
+  const double wrong = drawUniform(0, config.context_false_positives, random);
   std::vector<Coord> open;
   for (size_t i = 0; i < candidates.size(); ++i) {
     const float* d = draws.data_ptr<float>() + 2 * i;
@@ -87,7 +87,7 @@ FineMask drawFineMask(const std::vector<Coord>& candidates, const CompletionSamp
 CoordBBox drawBounds(const CompletionSample& s, const CompleterConfig& config,
                      torch::Generator& random) {
   const VoxelFrame& frame = s.condition.frame;
-  if (uniform(random) >= config.window_share) return frame.bounds;
+  if (drawUniform(random) >= config.window_share) return frame.bounds;
   const int outwards = int(2.8 / frame.voxel_m / 4), most = int(16 / frame.voxel_m / 4);
   CoordBBox bounds = frame.bounds;
   for (int axis = 0; axis < 3; ++axis) {
@@ -225,8 +225,8 @@ DrawnScene drawScene(CompleterNet& net, const CompletionSample& s, double own_ga
 
   // The fine stage works inside what the coarse stage keeps, as it is or as a better one would be:
   // all of the truth and what it takes for true.
-  d.own = !c.coarse_stage || uniform(random) < own_gate;
-  const double tau = d.own ? CompleteSettings().coarse_tau : uniform(.05, .5, random);
+  d.own = !c.coarse_stage || drawUniform(random) < own_gate;
+  const double tau = d.own ? CompleteSettings().coarse_tau : drawUniform(.05, .5, random);
   if (d.own) {
     torch::NoGradGuard no_grad;
     for (const Coord& node : scene.coarse_filled) d.asked.set(node, 1);
@@ -292,7 +292,7 @@ FineLosses fineLosses(CompleterNet& net, const CompletionSample& s, const DrawnS
   in[kVisible].features = d.target_z.index_select(0, torch::tensor(visible_rows, torch::kInt64));
   in[kVisible].features =
       in[kVisible].features +
-      uniform(0, c.context_noise, random) * torch::randn(in[kVisible].features.sizes(), random);
+      drawUniform(0, c.context_noise, random) * torch::randn(in[kVisible].features.sizes(), random);
   const CompleterNet::Fine f = net.fine(in, d.frame);
   l.fine = occupancyLoss(f.logits, labelsOf(targets, s.target_nodes, c.unobserved_weight), c);
 

@@ -142,9 +142,9 @@ std::vector<Coord> openGate(CompleterNet& net, float coarse_tau, GrowthScene* sc
       found.clear();
       for (const Coord& c : ring) beside.setValueOn(c), openNode(c);
     }
+    const openvdb::tree::ValueAccessor<const TokenMask> is_beside(beside);
     const auto reached =
         std::stable_partition(pending.begin(), pending.end(), [&](const Chunk& chunk) {
-          const openvdb::tree::ValueAccessor<const TokenMask> is_beside(beside);
           return std::none_of(chunk.tokens.begin(), chunk.tokens.end(),
                               [&](const Coord& c) { return is_beside.isValueOn(c); });
         });
@@ -207,15 +207,14 @@ void growLevels(CompleterNet& net, const GrowthScene& scene, const std::vector<C
 }
 
 void thinSurfaces(Growth* g, Place* dropped) {
-  const auto given = size_t(g->given);
-  Place asked = keepRows(g->place, [&](size_t i) { return i >= given; });
-  appendRows(&asked, *dropped);
-  const std::vector<uint8_t> thick = thickTokens(asked);
-  const auto stays = [&](size_t i) { return i < given || !thick[i - given]; };
-  std::vector<int64_t> rows;
-  for (size_t i = 0; i < g->place.ijk.size(); ++i)
-    if (stays(i)) rows.push_back(int64_t(i));
-  appendRows(dropped, keepRows(g->place, [&](size_t i) { return !stays(i); }));
+  const int64_t seeds = g->seeds();
+  Place generated = keepRows(g->place, [&](size_t i) { return int64_t(i) >= seeds; });
+  appendRows(&generated, *dropped);
+  const std::vector<uint8_t> thick = thickTokens(generated);
+  std::vector<int64_t> rows, thin;
+  for (int64_t i = 0; i < g->place.size(); ++i)
+    (i < g->given || !thick[size_t(i - seeds)] ? rows : thin).push_back(i);
+  appendRows(dropped, selectRows(g->place, thin));
   g->place = selectRows(g->place, rows);
   g->z = rowsOf(g->z, rows);
 }

@@ -13,7 +13,8 @@ Windows::Windows(const VoxelFrame& whole, const CoordBBox& content, const Comple
   constexpr int kCoarse = 1 << (kTokenLevels - 1);  // voxels: no window cuts a coarse node
   const double extent = double(config.positions.extent_m) / whole.voxel_m;  // voxels
   overlap_ = int(std::lround(config.window_overlap_m / whole.voxel_m / kCoarse)) * kCoarse;
-  const int64_t pitch = int64_t((extent - 2 * overlap_) / kCoarse) * kCoarse;
+  const int64_t pitch =
+      std::max<int64_t>(kCoarse, int64_t((extent - 2 * overlap_) / kCoarse) * kCoarse);
   for (int axis = 0; axis < 3; ++axis) {
     const int64_t begin = whole.bounds.min()[axis], end = int64_t(whole.bounds.max()[axis]) + 1,
                   low = content.min()[axis], high = int64_t(content.max()[axis]) + 1;
@@ -58,7 +59,8 @@ std::vector<size_t> Windows::around(const std::vector<Coord>& nodes, int level) 
   std::set<size_t> numbers;
   for (const Coord& node : nodes) {
     const Coord voxel = firstVoxel(node, level);
-    // An overlap is shorter than a window: these reach every window that is near enough.
+    // An overlap is shorter than any window but the outermost: these reach every window that is
+    // near enough.
     for (int x : {-overlap_, 0, overlap_})
       for (int y : {-overlap_, 0, overlap_})
         for (int z : {-overlap_, 0, overlap_}) numbers.insert(at(voxel.offsetBy(x, y, z)));

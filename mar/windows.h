@@ -15,11 +15,12 @@ struct Window {
 };
 
 /// Cuts a volume into windows no wider than the position code was made for, around its content: a
-/// room that fits into one window is not cut, however wide the volume. Windows are numbered, z
-/// fastest, and made when asked for: a wide volume has many, of which few hold anything.
+/// room that fits into one, less its overlaps, is not cut, however wide the volume. Windows are
+/// numbered, z fastest, and made when asked for: a wide volume has many, of which few hold
+/// anything.
 class Windows {
  public:
-  /// `content` [voxels]: the coarse nodes where something was observed.
+  /// `content` [voxels]: the filled coarse nodes.
   Windows(const VoxelFrame& whole, const CoordBBox& content, const CompleterConfig& config);
 
   Window window(size_t number) const;

@@ -277,13 +277,12 @@ std::vector<size_t> neighboursOf(const std::vector<SeenImage>& images, size_t i)
   std::vector<std::pair<int, size_t>> shared;
   for (size_t j = 0; j < images.size(); ++j) {
     if (j == i) continue;
+    const Camera& other = images[j].view.camera;
     int count = 0;
     for (int y = step / 2; y < image.height(); y += step)
       for (int x = step / 2; x < image.width(); x += step) {
         const float q = image.q[image.pixel(x, y)];
-        if (q > 0)
-          count +=
-              images[j].view.camera.pixelAt(images[j].view.camera.project(image.point(x, y))) >= 0;
+        if (q > 0) count += other.pixelAt(other.project(image.point(x, y))) >= 0;
       }
     if (count > 0) shared.emplace_back(-count, j);
   }

@@ -143,17 +143,23 @@ TEST_F(CompleterFile, NothingThatItKeepsOnlyThickensASurface) {  // section 4.10
   const Completer completer = completerOf(toyConfig());
   CompleteSettings settings;
   settings.tau = .5f, settings.hole_tau = 1;
-  const Place whole = complete(completer, settings),
-              all = visited(completer, startOf(sample_), settings),
-              asked =
-                  keepRows(all, [&](size_t i) { return int64_t(i) >= sample_.condition.size(); });
-  const std::vector<uint8_t> thick = thickTokens(asked);
-  std::set<Coord> expected(sample_.condition.ijk.begin(), sample_.condition.ijk.end());
-  for (size_t i = 0; i < thick.size(); ++i)
-    if (!thick[i] && asked.probability[i] > settings.tau) expected.insert(asked.ijk[i]);
-  EXPECT_GT(std::count(thick.begin(), thick.end(), uint8_t(1)), 0);
-  EXPECT_EQ(std::set<Coord>(whole.ijk.begin(), whole.ijk.end()), expected);
+  // From what was observed; then beside half of what that made, which stays as it is.
+  Place start = startOf(sample_);
+  for (const bool has_given : {false, true}) {
+    const Place whole = completer.complete(start, settings, silent_),
+                all = visited(completer, start, settings),
+                generated =
+                    keepRows(all, [&](size_t i) { return int64_t(i) >= sample_.condition.size(); });
+    const std::vector<uint8_t> thick = thickTokens(generated);
+    std::set<Coord> expected(start.ijk.begin(), start.ijk.end());
+    for (size_t i = 0; i < thick.size(); ++i)
+      if (!thick[i] && generated.probability[i] > settings.tau) expected.insert(generated.ijk[i]);
+    EXPECT_GT(std::count(thick.begin(), thick.end(), uint8_t(1)), 0);
+    EXPECT_EQ(std::set<Coord>(whole.ijk.begin(), whole.ijk.end()), expected) << has_given;
+    start = keepRows(whole, [&](size_t i) { return !whole.generated[i] || whole.ijk[i].y() < 5; });
+  }
   // Tokens that were given stay, however thick they make a surface.
+  const Place all = visited(completer, startOf(sample_), settings);
   settings.region = std::make_shared<const TokenMask>();  // nothing new
   EXPECT_EQ(completer.complete(all, settings, silent_).ijk, all.ijk);
 }
@@ -327,27 +333,35 @@ TEST_F(CompleterFile, KeptTokensConditionTheNextLevel) {  // section 4.8
 
 TEST_F(CompleterFile, GoesOnFromAnyLevelAsIfItHadNeverStopped) {
   const Completer completer = completerOf(toyConfig());
-  for (const bool generated_context : {false, true}) {
-    CompleteSettings settings;
-    settings.tau = .5f, settings.hole_tau = .1f, settings.sampling_steps = 3;
-    settings.generated_context = generated_context;
-    std::vector<std::pair<Place, int32_t>> stops;
-    const Place whole = completer.complete(startOf(sample_), settings, silent_,
-                                           [&](const Place& so_far, int32_t next_level) {
-                                             stops.push_back({so_far, next_level});
-                                           });
-    ASSERT_GE(stops.size(), 3u);
-    for (const auto& [so_far, next_level] : stops) {
-      SCOPED_TRACE(next_level);
-      settings.first_level = next_level, settings.begun_with = sample_.condition.size();
-      const Place rest = completer.complete(so_far, settings, silent_);
-      EXPECT_EQ(rest.ijk, whole.ijk);
-      EXPECT_EQ(std::memcmp(rest.z.data(), whole.z.data(), whole.z.size() * sizeof(float)), 0);
-      EXPECT_EQ(rest.probability, whole.probability);
-      EXPECT_EQ(rest.bfs_level, whole.bfs_level);
-      EXPECT_EQ(rest.generated, whole.generated);
+  CompleteSettings settings;
+  settings.tau = .3f;
+  const Place some = complete(completer, settings);
+  // From what was observed; and with tokens that were given, some of them below tau.
+  const Place given =
+      keepRows(some, [&](size_t i) { return !some.generated[i] || some.ijk[i].y() < 5; });
+  settings.tau = .5f, settings.hole_tau = .1f, settings.sampling_steps = 3;
+  ASSERT_LT(*std::min_element(given.probability.begin(), given.probability.end()), settings.tau);
+  for (const Place& start : {startOf(sample_), given})
+    for (const bool generated_context : {false, true}) {
+      settings.generated_context = generated_context;
+      settings.first_level = 1, settings.begun_with = -1;
+      std::vector<std::pair<Place, int32_t>> stops;
+      const Place whole = completer.complete(start, settings, silent_,
+                                             [&](const Place& so_far, int32_t next_level) {
+                                               stops.push_back({so_far, next_level});
+                                             });
+      ASSERT_GE(stops.size(), 3u);
+      for (const auto& [so_far, next_level] : stops) {
+        SCOPED_TRACE(next_level);
+        settings.first_level = next_level, settings.begun_with = start.size();
+        const Place rest = completer.complete(so_far, settings, silent_);
+        EXPECT_EQ(rest.ijk, whole.ijk);
+        EXPECT_EQ(std::memcmp(rest.z.data(), whole.z.data(), whole.z.size() * sizeof(float)), 0);
+        EXPECT_EQ(rest.probability, whole.probability);
+        EXPECT_EQ(rest.bfs_level, whole.bfs_level);
+        EXPECT_EQ(rest.generated, whole.generated);
+      }
     }
-  }
 }
 
 TEST_F(CompleterFile, LatentsAreWhatFilesHold) {

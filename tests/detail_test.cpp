@@ -336,7 +336,7 @@ TEST(Join, ColoursOfBothSidesMeetAndPartFartherOn) {
     if (beyond > 0 && beyond < .2f) near = std::max(near, (colour - wall.seen_colour).norm());
     if (beyond > 2) far = std::max(far, (colour - wall.generated_colour).norm());
   });
-  EXPECT_LT(near, .045f);  // a quarter of what they are apart
+  EXPECT_LT(near, .045f);  // a quarter of what they are apart, as in two voxels some part is
   EXPECT_LT(far, .09f);
 }
 

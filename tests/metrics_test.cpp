@@ -30,7 +30,7 @@ Image pattern(int kind, int width = 96, int height = 64) {
   return image;
 }
 
-Image uniform(float r, float g, float b) {
+Image uniformImage(float r, float g, float b) {
   Image image(24, 24, 3);
   for (size_t i = 0; i < image.data.size(); ++i)
     image.data[i] = i % 3 == 0 ? r : i % 3 == 1 ? g : b;
@@ -77,12 +77,12 @@ TEST(Flip, UniformImagesHaveAClosedForm) {
       {0, 0, 0}, {1, 1, 1}, {.5, .5, .5}, {.2, .7, .1}, {.9, .1, .4}};
   for (const auto& a : colours)
     for (const auto& b : colours) {
-      const Image map = flipMap(uniform(float(a[0]), float(a[1]), float(a[2])),
-                                uniform(float(b[0]), float(b[1]), float(b[2])));
+      const Image map = flipMap(uniformImage(float(a[0]), float(a[1]), float(a[2])),
+                                uniformImage(float(b[0]), float(b[1]), float(b[2])));
       for (float v : map.data)
         ASSERT_NEAR(v, flipOfUniform(a, b), 1e-4) << a.transpose() << " / " << b.transpose();
     }
-  EXPECT_NEAR(flip(uniform(0, 1, 0), uniform(0, 0, 1)), 1, 1e-5);  // the largest there is
+  EXPECT_NEAR(flip(uniformImage(0, 1, 0), uniformImage(0, 0, 1)), 1, 1e-5);  // the largest there is
 }
 
 TEST(Flip, IsSymmetricBoundedAndZeroForEqualImages) {

@@ -28,6 +28,14 @@ std::vector<VoxelFrame> volumes() {
           frameOf(CoordBBox(Coord(1, 2, 3), Coord(97, 41, 47)), .35f)};
 }
 
+/// Where something may have been seen in it: everywhere, in a corner, nowhere, beyond it.
+std::vector<CoordBBox> contents(const VoxelFrame& frame) {
+  CoordBBox beyond = frame.bounds;
+  beyond.expand(40);
+  return {frame.bounds, voxelsIn(tokenCoord(frame.bounds.max(), 2), 2), CoordBBox(),
+          voxelsIn(tokenCoord(frame.bounds.min(), 2), 2), beyond};
+}
+
 /// All of them, by number.
 std::vector<Window> allOf(const Windows& windows, const VoxelFrame& frame) {
   std::vector<Window> all;
@@ -37,24 +45,25 @@ std::vector<Window> allOf(const Windows& windows, const VoxelFrame& frame) {
 
 TEST(Windows, CoresPartTheVolumeAndCutNoCoarseNode) {
   size_t most = 0;
-  for (const VoxelFrame& frame : volumes()) {
-    const Windows windows(frame, frame.bounds, CompleterConfig());
-    const std::vector<Window> all = allOf(windows, frame);
-    most = std::max(most, all.size());
-    uint64_t volume = 0;
-    for (const Window& w : all) {
-      EXPECT_TRUE(frame.bounds.isInside(w.core));
-      volume += w.core.volume();
+  for (const VoxelFrame& frame : volumes())
+    for (const CoordBBox& content : contents(frame)) {
+      const Windows windows(frame, content, CompleterConfig());
+      const std::vector<Window> all = allOf(windows, frame);
+      most = std::max(most, all.size());
+      uint64_t volume = 0;
+      for (const Window& w : all) {
+        EXPECT_TRUE(frame.bounds.isInside(w.core));
+        volume += w.core.volume();
+      }
+      EXPECT_EQ(volume, frame.bounds.volume());
+      for (auto voxel = frame.bounds.begin(); voxel; ++voxel) {
+        const size_t own = windows.of(*voxel, 0);
+        ASSERT_LT(own, all.size());
+        ASSERT_TRUE(all[own].core.isInside(*voxel)) << *voxel;  // of equal volume: in no other
+        for (int level : {1, 2})
+          ASSERT_EQ(windows.of(tokenCoord(*voxel, level), level), own) << *voxel << " " << level;
+      }
     }
-    EXPECT_EQ(volume, frame.bounds.volume());
-    for (auto voxel = frame.bounds.begin(); voxel; ++voxel) {
-      const size_t own = windows.of(*voxel, 0);
-      ASSERT_LT(own, all.size());
-      ASSERT_TRUE(all[own].core.isInside(*voxel)) << *voxel;  // of equal volume: in no other
-      for (int level : {1, 2})
-        ASSERT_EQ(windows.of(tokenCoord(*voxel, level), level), own) << *voxel << " " << level;
-    }
-  }
   EXPECT_GT(most, 30u);
 }
 
@@ -62,53 +71,54 @@ TEST(Windows, FramesAreCoresWithTheirSurroundingsInThePositionCodesExtent) {
   CompleterConfig narrow;
   narrow.positions.extent_m = 6, narrow.window_overlap_m = .8f;
   for (const CompleterConfig& config : {CompleterConfig(), narrow})
-    for (const VoxelFrame& frame : volumes()) {
-      const Windows windows(frame, frame.bounds, config);
-      const int overlap =
-          int(std::lround(config.window_overlap_m / frame.voxel_m / 4)) * 4;  // whole coarse nodes
-      for (const Window& w : allOf(windows, frame)) {
-        EXPECT_EQ(w.frame.voxel_m, frame.voxel_m);
-        for (int axis = 0; axis < 3; ++axis) {
-          EXPECT_EQ(w.frame.bounds.min()[axis],
-                    std::max(w.core.min()[axis] - overlap, frame.bounds.min()[axis]));
-          EXPECT_EQ(w.frame.bounds.max()[axis],
-                    std::min(w.core.max()[axis] + overlap, frame.bounds.max()[axis]));
-          // Cuts and overlaps move to coarse nodes, by at most one each.
-          EXPECT_LE(float(w.frame.bounds.dim()[axis]) * frame.voxel_m,
-                    config.positions.extent_m + 12 * frame.voxel_m);
-          if (frame.bounds.dim()[axis] * double(frame.voxel_m) <=
-              double(config.positions.extent_m)) {
-            EXPECT_EQ(w.core.dim()[axis], frame.bounds.dim()[axis]) << "no need to cut";
+    for (const VoxelFrame& frame : volumes())
+      for (const CoordBBox& content : contents(frame)) {
+        const Windows windows(frame, content, config);
+        const int overlap = int(std::lround(config.window_overlap_m / frame.voxel_m / 4)) *
+                            4;  // whole coarse nodes
+        for (const Window& w : allOf(windows, frame)) {
+          EXPECT_EQ(w.frame.voxel_m, frame.voxel_m);
+          for (int axis = 0; axis < 3; ++axis) {
+            EXPECT_EQ(w.frame.bounds.min()[axis],
+                      std::max(w.core.min()[axis] - overlap, frame.bounds.min()[axis]));
+            EXPECT_EQ(w.frame.bounds.max()[axis],
+                      std::min(w.core.max()[axis] + overlap, frame.bounds.max()[axis]));
+            EXPECT_LE(float(w.frame.bounds.dim()[axis]) * frame.voxel_m,
+                      config.positions.extent_m + 1e-3f);
+            if (frame.bounds.dim()[axis] * double(frame.voxel_m) <=
+                double(config.positions.extent_m)) {
+              EXPECT_EQ(w.core.dim()[axis], frame.bounds.dim()[axis]) << "no need to cut";
+            }
           }
         }
       }
-    }
 }
 
 TEST(Windows, AroundAreThoseWhoseFramesHoldANode) {
   std::mt19937 random(1);
-  for (const VoxelFrame& frame : volumes()) {
-    const Windows windows(frame, frame.bounds, CompleterConfig());
-    const std::vector<Window> all = allOf(windows, frame);
-    for (int level : {1, 2})
-      for (int trial = 0; trial < 60; ++trial) {
-        std::vector<Coord> nodes;
-        for (int i = 0; i < trial % 4; ++i) {
-          Coord voxel;
-          for (int axis = 0; axis < 3; ++axis)
-            voxel[axis] =
-                frame.bounds.min()[axis] + int(random() % unsigned(frame.bounds.dim()[axis]));
-          nodes.push_back(tokenCoord(voxel, level));
+  for (const VoxelFrame& frame : volumes())
+    for (const CoordBBox& content : contents(frame)) {
+      const Windows windows(frame, content, CompleterConfig());
+      const std::vector<Window> all = allOf(windows, frame);
+      for (int level : {1, 2})
+        for (int trial = 0; trial < 60; ++trial) {
+          std::vector<Coord> nodes;
+          for (int i = 0; i < trial % 4; ++i) {
+            Coord voxel;
+            for (int axis = 0; axis < 3; ++axis)
+              voxel[axis] =
+                  frame.bounds.min()[axis] + int(random() % unsigned(frame.bounds.dim()[axis]));
+            nodes.push_back(tokenCoord(voxel, level));
+          }
+          std::vector<size_t> truth;
+          for (size_t i = 0; i < all.size(); ++i)
+            if (std::any_of(nodes.begin(), nodes.end(), [&](const Coord& node) {
+                  return all[i].frame.bounds.hasOverlap(voxelsIn(node, level));
+                }))
+              truth.push_back(i);
+          ASSERT_EQ(windows.around(nodes, level), truth);
         }
-        std::vector<size_t> truth;
-        for (size_t i = 0; i < all.size(); ++i)
-          if (std::any_of(nodes.begin(), nodes.end(), [&](const Coord& node) {
-                return all[i].frame.bounds.hasOverlap(voxelsIn(node, level));
-              }))
-            truth.push_back(i);
-        ASSERT_EQ(windows.around(nodes, level), truth);
-      }
-  }
+    }
 }
 
 TEST(Windows, SplitKeepsTokensAndTheirOrder) {
@@ -135,6 +145,14 @@ TEST(Windows, ContentThatFitsIntoOneIsNotCut) {
     const Windows windows(frame, content, CompleterConfig());
     ASSERT_EQ(windows.of(content.min(), 0), windows.of(content.max(), 0)) << content;
   }
+}
+
+TEST(Windows, HaveAtLeastACoarseNodeASide) {
+  CompleterConfig narrow;
+  narrow.positions.extent_m = 1, narrow.window_overlap_m = .25f;
+  const VoxelFrame frame = volumes()[1];
+  const Windows windows(frame, frame.bounds, narrow);
+  for (const Window& w : allOf(windows, frame)) EXPECT_FALSE(w.core.empty());
 }
 
 TEST(Windows, AVolumeOfAnySizeCostsNothing) {

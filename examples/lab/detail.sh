@@ -16,7 +16,7 @@ job() {
   shift 4
   [ "$seconds" != $first ] || optimise=30
   if ! [ -s "$folder/$name.jsonl" ]; then
-    "$lab" eval --reconstruct --scenes "$scenes" --views "$views" --detail "$seconds" --optimise $optimise "$@" --json \
+    "$lab" eval --reconstruct --scenes "$scenes" --views "$views" --detail "$seconds" --optimise $optimise --threads 1 "$@" --json \
       2>>"$folder/log" >"$folder/$name.draft"
     mv "$folder/$name.draft" "$folder/$name.jsonl"
   fi
@@ -32,6 +32,8 @@ if [ -d "$data/rgbd_redkitchen" ]; then
   kinds="$kinds kitchen-4 kitchen-12"
   for seconds in $first .25 .5 1 2 5 10 30; do
     job kitchen-4 $seconds "$data/rgbd_redkitchen" 4 --frames 0,6,12,18
+  done
+  for seconds in $first .25 .5 1 2 5 10 30; do
     job kitchen-12 $seconds "$data/rgbd_redkitchen" 12 --frames 0,2,4,6,8,10,12,14,16,18,20,22
   done
 fi

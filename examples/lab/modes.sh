@@ -38,6 +38,7 @@ mode 'generated context, random order' --generated-context --random-order
 mode 'generated context, drawn at .5' --generated-context --sampling-steps 10 --temperature .5
 mode 'observed rewritten' --refine-observed
 for jobs in "$in_rooms" "$in_kitchen"; do
+  [ -n "$jobs" ] || continue
   compare "$jobs" --method completed \
     --scores mean_psnr unseen_psnr unseen_flip near_precision near_recall near_f1 f1 blocked leak gaussians
   echo
