@@ -60,8 +60,9 @@ budget(text) = strstrt("0123456789.", substr(text, 1, 1)) > 0
 fitted(kind, column_) = budget(word(strcol("configuration"), 2)) ? of(kind, column_) : NaN
 optimised(kind, column_) = word(strcol("configuration"), 2) eq "optimised" ? of(kind, column_) : NaN
 kinds = "rooms-2 rooms-4 rooms-12 kitchen-4 kitchen-12"
+set linetype 5 lc rgb "#d62728"
 set multiplot layout 1,2
-set grid; set key bottom right; set logscale x
+set grid; set key outside bottom center horizontal; set logscale x; set offsets graph 0, 0, .05, .05
 set xlabel "measured seconds of placing and fitting, one core"; set ylabel "PSNR where views saw [dB]"
 do for [score in "input_psnr other_seen_psnr"] {
   set title score eq "input_psnr" ? "Input views" : "Other views"
