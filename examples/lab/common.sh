@@ -14,6 +14,16 @@ scratch() {
 # finished LOG STEPS: whether a training came to its last step.
 finished() { [ -f "$1" ] && [ "$(tail -n 1 "$1" | cut -d, -f1)" = "$2" ]; }
 
+# evaluate FILE OPTION...: the lines of vdb_lab eval, on one thread, unless FILE is there already.
+evaluate() {
+  lines=$1
+  shift
+  if [ -s "$lines" ]; then return; fi
+  echo "$lines" >&2
+  "$lab" eval "$@" --threads 1 --json 2>>"$folder/eval.log" >"$folder/draft-$$.jsonl"
+  mv "$folder/draft-$$.jsonl" "$lines"
+}
+
 # compare LINES [OPTION...]: vdb_lab's, of lines NAME=FILE.
 compare() (
   lines=$1

@@ -38,11 +38,7 @@ judge() {
   shift 2
   judged="$judged$name=$folder/judged/$name.jsonl
 "
-  if [ -s "$folder/judged/$name.jsonl" ]; then return; fi
-  echo "judging $name" >&2
-  "$lab" eval --scenes "rooms:$rooms" --views 2 --weights "$folder/runs/$run" --threads 1 --json "$@" \
-    2>>"$folder/judged/$name.err" >"$folder/part.jsonl"
-  mv "$folder/part.jsonl" "$folder/judged/$name.jsonl"
+  evaluate "$folder/judged/$name.jsonl" --scenes "rooms:$rooms" --views 2 --weights "$folder/runs/$run" "$@"
 }
 
 for file in encoder completer; do ln -sfn "$weights/$file.safetensors" "$folder/runs/shipped/$file.safetensors"; done

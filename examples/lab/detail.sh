@@ -10,16 +10,13 @@ rooms=${2:-rooms:1-4}
 scratch "$root/out/detail"
 
 # job NAME SECONDS SCENES VIEWS [OPTION...]: adds "NAME SECONDS" to `jobs`; the first SECONDS carry the baselines.
-jobs= first=.01
+jobs='' first=.01
 job() {
   name="$1 $2" seconds=$2 scenes=$3 views=$4 optimise=0
   shift 4
   [ "$seconds" != $first ] || optimise=30
-  if ! [ -s "$folder/$name.jsonl" ]; then
-    "$lab" eval --reconstruct --scenes "$scenes" --views "$views" --detail "$seconds" --optimise $optimise --threads 1 "$@" --json \
-      2>>"$folder/log" >"$folder/$name.draft"
-    mv "$folder/$name.draft" "$folder/$name.jsonl"
-  fi
+  evaluate "$folder/$name.jsonl" --reconstruct --scenes "$scenes" --views "$views" --detail "$seconds" \
+    --optimise $optimise "$@"
   jobs="$jobs$name=$folder/$name.jsonl
 "
 }

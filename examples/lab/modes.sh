@@ -10,24 +10,17 @@ rooms=${2:-rooms:33-38}
 scratch "$root/out/modes"
 
 # mode NAME [OPTION...]: adds a line to `jobs` for rooms and kitchen each.
-in_rooms= in_kitchen=
+in_rooms='' in_kitchen=''
 mode() {
   name=$1
   shift
-  judge "$folder/rooms $name.jsonl" --scenes "$rooms" --views 2 "$@"
+  evaluate "$folder/rooms $name.jsonl" --scenes "$rooms" --views 2 "$@"
   in_rooms="$in_rooms$name=$folder/rooms $name.jsonl
 "
   [ -d "$data/rgbd_redkitchen" ] || return 0
-  judge "$folder/kitchen $name.jsonl" --scenes "$data/rgbd_redkitchen" --frames 0,6,12,18 "$@"
+  evaluate "$folder/kitchen $name.jsonl" --scenes "$data/rgbd_redkitchen" --frames 0,6,12,18 "$@"
   in_kitchen="$in_kitchen$name=$folder/kitchen $name.jsonl
 "
-}
-judge() {
-  file=$1
-  shift
-  if [ -s "$file" ]; then return; fi
-  "$lab" eval "$@" --threads 1 --json 2>>"$folder/log" >"$folder/draft"
-  mv "$folder/draft" "$file"
 }
 
 mode mean

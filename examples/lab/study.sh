@@ -24,22 +24,16 @@ fileOf() { echo "$results/completion-$(echo "$1" | tr : _)-$2.jsonl"; }
 
 # part SCENES VIEWS
 part() {
-  if [ -s "$(fileOf "$1" "$2")" ]; then return; fi
-  echo "$1, $2 views" >&2
   sweep=
   [ "$1" = "$some" ] && sweep=${taus:+--taus $taus}
   # shellcheck disable=SC2086  # one word each
-  "$lab" eval --scenes "$1" --views "$2" --threads 1 $sweep --json 2>>"$folder/eval.log" >"$folder/part-$$.jsonl"
-  mv "$folder/part-$$.jsonl" "$(fileOf "$1" "$2")"
+  evaluate "$(fileOf "$1" "$2")" --scenes "$1" --views "$2" $sweep
 }
 
 # capture NAME FRAMES: judged by its other frames.
 capture() {
-  file=$results/completion-$1.jsonl
-  if [ -s "$file" ] || [ ! -d "$data/rgbd_$1" ]; then return; fi
-  echo "$1, frames $2" >&2
-  "$lab" eval --scenes "$data/rgbd_$1" --frames "$2" --threads 1 --json 2>>"$folder/eval.log" >"$folder/part-$$.jsonl"
-  mv "$folder/part-$$.jsonl" "$file"
+  [ ! -d "$data/rgbd_$1" ] ||
+    evaluate "$results/completion-$1.jsonl" --scenes "$data/rgbd_$1" --frames "$2"
 }
 
 if [ -n "${PARTS:-}" ]; then
