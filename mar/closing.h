@@ -12,10 +12,9 @@ namespace vdbc {
 /// volume: a token of probability p costs -log p, other unobserved nodes stay open (minimum cut,
 /// paths through faces). Of the set, those with p > `least`: rows of `dropped`, by coordinates.
 /// `occupied` are the tokens that are there besides the filled ones of `nodes`. Where open nodes
-/// lead out, what can be closed is. Nodes within half a metre
-/// of a camera of `dropped` stay open, and so do holes of more than a hundred tokens (neighbours
-/// through corners too). Time and memory follow the tokens and `nodes`, not the
-/// volume.
+/// lead out, what can be closed is. Nodes within half a metre of a camera of `dropped` stay open,
+/// and so do holes of more than a hundred tokens (neighbours through corners too). Time and memory
+/// follow the tokens and `nodes`, not the volume.
 std::vector<int64_t> closingTokens(const SeenSpace& nodes, const std::vector<Coord>& occupied,
                                    const Place& dropped, float least);
 

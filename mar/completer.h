@@ -59,14 +59,14 @@ class Completer {
   std::string trainedOn() const;
 
   /// `start` plus generated tokens: coarse gate, then growth level by level, then surfaces are
-  /// thinned to one token and small holes closed. `start` has observed
-  /// tokens first; generated ones after them stay as they are and are not visited again. Its rows
-  /// come first, bit-identical unless refine_observed; generated latents are rounded to half
-  /// precision, so that files hold them exactly. Tokens that are F or E in `start.seen` are never
-  /// visited. Places larger than the configuration's `extent_m` are looked at in overlapping
-  /// windows, by the coarse stage and by the position code; windows without anything filled stay as
-  /// they are. Time and memory follow what was seen and what is generated, not the volume. Same
-  /// seed, same place, whatever the number of threads.
+  /// thinned to one token and small holes closed. `start` has observed tokens first; generated ones
+  /// after them stay as they are and are not visited again. Its rows come first, bit-identical
+  /// unless refine_observed; generated latents are rounded to half precision, so that files hold
+  /// them exactly. Tokens that are F or E in `start.seen` are never visited. Places larger than the
+  /// configuration's `extent_m` are looked at in overlapping windows, by the coarse stage and by
+  /// the position code; windows without anything filled stay as they are. Time and memory follow
+  /// what was seen and what is generated, not the volume. Same seed, same place, whatever the
+  /// number of threads.
   Place complete(const Place& start, const CompleteSettings& settings, Progress& progress,
                  const LevelListener& listener = nullptr) const;
 

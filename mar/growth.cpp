@@ -123,9 +123,8 @@ std::vector<Coord> openGate(CompleterNet& net, float coarse_tau, GrowthScene* sc
     parts.push_back(std::move(part));
   }
 
-  // The open nodes, all of them, and those whose neighbours are still to be looked at.
-  TokenMask open, beside;  // `beside`: neighbours of open nodes
-  std::vector<Coord> found = scene->tokens.coarse_filled;
+  TokenMask open, beside;                                  // nodes, and their neighbours
+  std::vector<Coord> found = scene->tokens.coarse_filled;  // neighbours not yet looked at
   for (const Coord& c : found) {
     scene->gate.set(c, 1);
     if (1 > coarse_tau) open.setValueOn(c);

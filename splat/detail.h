@@ -34,9 +34,8 @@ struct Detail {
 };
 
 /// Discs of everything that the views saw; `carving` says which pixels have a depth, means are from
-/// `origin`. Views of more than a million
-/// pixels are looked at reduced. Parallel; the same bytes for any number of threads. Throws Error
-/// for views without colour or depth, and Cancelled.
+/// `origin`. Views of more than a million pixels are looked at reduced. Parallel; the same bytes
+/// for any number of threads. Throws Error for views without colour or depth, and Cancelled.
 Detail seenDetail(const std::vector<View>& views, const DetailSettings& settings,
                   const CarveSettings& carving, const Eigen::Vector3d& origin, Progress& progress);
 

@@ -57,6 +57,8 @@ TEST_F(ReadViews, FramesAreSelectedInTheOrderAskedFor) {
   expectUnreadable(path("c"), {"frame 3", "0 to 2"}, settings);
   settings.frames = {-1};
   expectUnreadable(path("c"), {"frame -1", "0 to 2"}, settings);
+  settings.frames = {1, 0, 1};
+  expectUnreadable(path("c"), {"frame 1", "twice"}, settings);
 }
 
 TEST_F(ReadViews, MissingAndEmptyPathsThrow) {

@@ -21,9 +21,9 @@ struct ReadViewsSettings {
 /// own pixel are invalid). 0 and 65535 in a 16-bit depth PNG are no measurement. Frames are read in
 /// parallel; the first bad frame's Error is thrown.
 /// Throws Error: no views, views without depth, mismatched sizes, corrupt files, frames out of
-/// range, distortion other than zero, singular or non-rigid poses, depth without one valid pixel, a
-/// pointmap of unknown scale, a scale for what is in metres already, a volume without surface or
-/// without free space for a camera.
+/// range or named twice, distortion other than zero, singular or non-rigid poses, depth without one
+/// valid pixel, a pointmap of unknown scale, a scale for what is in metres already, a volume
+/// without surface or without free space for a camera.
 std::vector<View> readViews(const std::string& path, const ReadViewsSettings& settings = {});
 
 /// The unit vector that points up in the world of views read from `path`: +Z for transforms.json

@@ -3,6 +3,7 @@
 #include <Eigen/LU>
 #include <algorithm>
 #include <cmath>
+#include <set>
 
 namespace vdbc {
 namespace {
@@ -62,9 +63,12 @@ std::vector<size_t> selectFrames(const ReadViewsSettings& settings, size_t count
                                  const std::string& path) {
   require(count > 0, kReadViews, ": ", path, ": no frames");
   std::vector<size_t> selected;
+  std::set<int> taken;
   for (int frame : settings.frames) {
     require(frame >= 0 && size_t(frame) < count, kReadViews, ": ", path, ": frame ", frame,
             " is out of range (expected 0 to ", count - 1, ")");
+    require(taken.insert(frame).second, kReadViews, ": ", path, ": frame ", frame,
+            " is named twice (expected different ones)");
     selected.push_back(size_t(frame));
   }
   if (selected.empty()) {
